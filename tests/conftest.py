@@ -1,0 +1,122 @@
+"""Small movies of Gaussian columns on a grid, with everything about them known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tract_dask import schema
+
+
+@dataclass
+class Scene:
+    """A grid of elliptical Gaussians on a flat background, with vacuum above it.
+
+    ``place`` (columns, 2) holds (x, y) in px; the frames show it shifted by ``drift`` (frames, 2), (y, x).
+    """
+
+    n_frames: int = 12
+    shape: tuple[int, int] = (160, 144)
+    spacing: float = 30.0
+    amplitude: float = 60.0
+    background: float = 20.0
+    sigma_a: float = 4.0
+    sigma_b: float = 3.0
+    theta: float = 0.4
+    max_drift: float = 4.0
+    seed: int = 0
+    place: np.ndarray = field(init=False)
+    drift: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.seed)
+        y, x = np.meshgrid(
+            np.arange(64, self.shape[0] - 20, self.spacing), np.arange(24, self.shape[1] - 20, self.spacing)
+        )
+        self.place = np.stack([x.T.ravel(), y.T.ravel()], axis=1) + rng.uniform(-0.5, 0.5, (x.size, 2))
+        steps = np.cumsum(rng.normal(0, 0.6, (self.n_frames, 2)), axis=0)
+        self.drift = np.clip(steps - np.median(steps, axis=0), -self.max_drift, self.max_drift)
+        self.drift -= np.median(self.drift, axis=0)
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """(columns, 7) truth in the summed image."""
+        truth = np.empty((len(self.place), 7))
+        truth[:] = self.amplitude, 0, 0, self.sigma_a, self.sigma_b, self.theta, self.background
+        truth[:, 1:3] = self.place
+        return truth
+
+    def frame(self, shift: np.ndarray, present: np.ndarray | None = None) -> np.ndarray:
+        """The noise-free scene shifted by ``shift`` (y, x); Equation 1, pixel by pixel."""
+        y, x = np.mgrid[: self.shape[0], : self.shape[1]]
+        image = np.full(self.shape, self.background, dtype=float)
+        cos, sin = np.cos(self.theta), np.sin(self.theta)
+        for k, (x0, y0) in enumerate(self.place):
+            if present is not None and not present[k]:
+                continue
+            dx, dy = x - x0 - shift[1], y - y0 - shift[0]
+            along, across = dx * cos - dy * sin, dx * sin + dy * cos
+            image += self.amplitude * np.exp(-0.5 * (along / self.sigma_a) ** 2 - 0.5 * (across / self.sigma_b) ** 2)
+        return image
+
+    def counts(self, present: np.ndarray | None = None, dtype: str = "uint16") -> np.ndarray:
+        """Poisson counts of all frames; ``present`` (frames, columns) leaves columns out."""
+        rng = np.random.default_rng(self.seed + 1)
+        shown = [None] * self.n_frames if present is None else list(present)
+        frames = [self.frame(shift, here) for shift, here in zip(self.drift, shown, strict=True)]
+        return rng.poisson(frames).astype(dtype)
+
+    def columns(self) -> xr.Dataset:
+        """The true columns, as a columns Dataset."""
+        truth = self.parameters
+        return xr.Dataset(
+            {
+                "x_ref": ("column_id", truth[:, 1]),
+                "y_ref": ("column_id", truth[:, 2]),
+                "kind": ("column_id", schema.texts(["Ce"] * len(truth))),
+                "fit_ref": (("column_id", "parameter"), truth),
+                "status_ref": ("column_id", np.zeros(len(truth), np.uint8)),
+            },
+            coords={"column_id": np.arange(1, len(truth) + 1)},
+            attrs={"window_px": 19},
+        )
+
+    def drift_dataset(self, error: np.ndarray | float = 0.0) -> xr.Dataset:
+        """The true drift (plus ``error``), as a drift Dataset."""
+        return xr.Dataset(
+            {
+                "drift": (("frame", "axis"), self.drift + error),
+                "quality": ("frame", np.ones(self.n_frames)),
+            },
+            coords={"frame": np.arange(self.n_frames), "axis": ("axis", schema.texts(schema.AXES))},
+        )
+
+    def summed(self) -> xr.Dataset:
+        """The noise-free scene, as a summed-image Dataset."""
+        return xr.Dataset(
+            {
+                "image": (("y", "x"), self.frame(np.zeros(2))),
+                "exposure": (("y", "x"), np.full(self.shape, self.n_frames, np.uint32)),
+            }
+        )
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+@pytest.fixture
+def npy(tmp_path: Path):
+    """Write frames to a .npy file and return its path."""
+
+    def write(frames: np.ndarray, name: str = "movie.npy") -> Path:
+        path = tmp_path / name
+        np.save(path, frames)
+        return path
+
+    return write

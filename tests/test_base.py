@@ -1,0 +1,141 @@
+"""Settings, errors, events, stores and the journal."""
+
+from __future__ import annotations
+
+import errno
+import json
+import pickle
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tract_dask import progress, provenance, settings, stores
+from tract_dask.errors import DestinationError, SettingsError, SourceError, StoreError, TractError
+from tract_dask.settings import ColumnSettings, FitSettings, RunSettings
+from tract_dask.shards import Journal, Shard, run_shards, split
+
+
+@given(n_frames=st.integers(1, 5000), per_shard=st.integers(1, 600))
+def test_every_frame_is_in_exactly_one_shard(n_frames, per_shard):
+    shards = split(n_frames, per_shard)
+    frames = [frame for shard in shards for frame in range(shard.start, shard.stop)]
+    assert frames == list(range(n_frames))
+    assert [shard.index for shard in shards] == list(range(len(shards)))
+
+
+def test_settings_survive_toml():
+    made = RunSettings(
+        fit=FitSettings(window_px=31, vacuum_box=(0, 10, 5, 50)),
+        columns=ColumnSettings(method="lattice", lattices=({"origin": [1.0, 2.0], "a_count": 3},)),
+    )
+    assert settings.from_toml(RunSettings, settings.to_toml(made)) == made
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FitSettings(blur_sigma_px=-1), "blur_sigma_px.*at least 0 and at most 20 px; got -1"),
+        (lambda: FitSettings(window_px=4.5), "window_px.*int; got 4.5"),
+        (lambda: FitSettings(intensity_scale="box"), "one of paper, ellipse; got 'box'"),
+        (lambda: FitSettings(threshold=float("nan")), "threshold.*out of range"),
+        (lambda: settings.from_toml(RunSettings, "[fit]\nwindow = 3"), "no setting 'window'"),
+        (lambda: settings.from_toml(RunSettings, "fit = 3"), "a table \\[fit\\]"),
+        (lambda: settings.from_toml(RunSettings, "[fit\n"), "not valid TOML"),
+        (lambda: settings.load(stores.Path("nowhere.toml")), "nowhere.toml: the settings file cannot be read"),
+    ],
+)
+def test_bad_settings_name_themselves(make, message):
+    with pytest.raises(SettingsError, match=message):
+        make()
+
+
+def test_an_error_is_one_paragraph_and_crosses_processes():
+    error = SourceError("page 3 has another shape", "movie.tif", "512 x 512", "512 x 500", "Export it again")
+    text = "movie.tif: page 3 has another shape. Expected 512 x 512; got 512 x 500. Export it again."
+    assert str(error) == text
+    assert str(pickle.loads(pickle.dumps(error))) == text
+    assert (TractError("x").exit_code, error.exit_code) == (1, 2)
+
+
+def test_events_become_lines_of_json(tmp_path):
+    sink = progress.JsonLines(tmp_path / "events.jsonl")
+    seen = []
+    send = progress.tee([sink, seen.append])
+    send(progress.StageStarted("fit", 10))
+    send(progress.ShardDone("fit", 0, 5, 100))
+    lines = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [line["event"] for line in lines] == ["StageStarted", "ShardDone"]
+    assert lines[1]["fits"] == 100
+    assert seen[1] == progress.ShardDone("fit", 0, 5, 100)
+
+
+def test_keys_tell_settings_apart_and_parts_from_each_other():
+    assert provenance.stage_key(FitSettings()) == provenance.stage_key(FitSettings())
+    assert provenance.stage_key(FitSettings()) != provenance.stage_key(FitSettings(threshold=3.0))
+    assert provenance.stage_key("ab", "c") != provenance.stage_key("a", "bc")
+
+
+def test_a_fingerprint_changes_with_the_file(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"1" * 100)
+    first = provenance.fingerprint(path)
+    assert provenance.fingerprint(path) == first
+    path.write_bytes(b"1" * 99 + b"2")
+    assert provenance.fingerprint(path) != first
+
+
+def test_the_journal_remembers_and_forgets_other_keys(tmp_path):
+    journal = Journal(tmp_path / "j", "key")
+    journal.record(Shard(3, 30, 40), {"fits": 5})
+    assert Journal(tmp_path / "j", "key").done() == {3: {"fits": 5}}
+    assert Journal(tmp_path / "j", "other").done() == {}
+
+
+def test_run_shards_does_only_what_is_missing(tmp_path):
+    journal = Journal(tmp_path / "j", "key")
+    shards = split(10, 3)
+    journal.record(shards[1], {"n": -1})
+    ran = []
+    payloads = run_shards(
+        lambda shard: {"n": shard.index},
+        shards,
+        journal=journal,
+        name="count",
+        on_done=lambda shard, payload: ran.append((shard.index, payload["n"])),
+    )
+    assert ran == [(0, 0), (2, 2), (3, 3)]
+    assert {k: p["n"] for k, p in payloads.items()} == {0: 0, 1: -1, 2: 2, 3: 3}
+
+
+def test_an_error_in_a_task_keeps_what_is_done(tmp_path):
+    journal = Journal(tmp_path / "j", "key")
+
+    def task(shard):
+        if shard.index == 2:
+            raise StoreError("no")
+        return {}
+
+    with pytest.raises(StoreError):
+        run_shards(task, split(10, 3), journal=journal, name="fail")
+    assert sorted(journal.done()) == [0, 1]
+
+
+def test_a_destination_that_holds_something_else_is_refused(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    with pytest.raises(DestinationError, match="holds something else"):
+        stores.check_destination(tmp_path / "mine")
+    with pytest.raises(DestinationError, match="cannot be written"):
+        stores.check_destination(tmp_path / "mine" / "thesis.txt" / "movie.zarr")
+    stores.check_destination(tmp_path / "new" / "movie.zarr")
+
+
+def test_a_small_disk_is_refused_with_both_numbers(tmp_path):
+    with pytest.raises(DestinationError, match=r"Expected 1000000000\.0 GB free; got"):
+        stores.check_free_space(tmp_path / "x", 10**18)
+
+
+def test_a_full_disk_says_so(tmp_path):
+    with pytest.raises(StoreError, match="what is done is kept"), stores.disk_errors(tmp_path):
+        raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,0 +1,63 @@
+"""Tracking of atomic columns in time-resolved TEM movies, out of core and distributed.
+
+The public names are imported when they are first used, so that ``import tract_dask`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .columns import find_columns, lattice_columns
+    from .conversion import convert
+    from .drift import estimate_drift
+    from .fit import fit_columns
+    from .io import open_source
+    from .movie import open_movie
+    from .pipeline import run
+    from .results import accepted, open_results
+    from .simulate import simulate_movie
+    from .summing import sum_image
+
+__version__ = "0.1.0"
+
+_ROOMS = {
+    "open_source": "io",
+    "convert": "conversion",
+    "open_movie": "movie",
+    "estimate_drift": "drift",
+    "sum_image": "summing",
+    "find_columns": "columns",
+    "lattice_columns": "columns",
+    "fit_columns": "fit",
+    "run": "pipeline",
+    "open_results": "results",
+    "accepted": "results",
+    "simulate_movie": "simulate",
+}
+
+__all__ = [
+    "accepted",
+    "convert",
+    "estimate_drift",
+    "find_columns",
+    "fit_columns",
+    "lattice_columns",
+    "open_movie",
+    "open_results",
+    "open_source",
+    "run",
+    "simulate_movie",
+    "sum_image",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOMS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ROOMS[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,72 @@
+"""The errors that users see: each says what is wrong, where, what was expected, what was found, and what to do."""
+
+from __future__ import annotations
+
+
+class TractError(Exception):
+    """An error with its place and its remedy; its text is one paragraph.
+
+    Parameters
+    ----------
+    what
+        What is wrong, as a sentence without its full stop.
+    where
+        File, page, setting or address.
+    expected, got
+        What was needed and what was found.
+    remedy
+        What the user can do, as a sentence without its full stop.
+
+    Examples
+    --------
+    >>> print(TractError("the movie has no frames", where="empty.tif", remedy="Check the export"))
+    empty.tif: the movie has no frames. Check the export.
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, where: str = "", expected: str = "", got: str = "", remedy: str = "") -> None:
+        super().__init__(what, where, expected, got, remedy)  # positional, so that it pickles between workers
+        self.what, self.where, self.expected, self.got, self.remedy = what, where, expected, got, remedy
+
+    def __str__(self) -> str:
+        found = "; ".join(
+            part
+            for part in (
+                f"expected {self.expected}" if self.expected else "",
+                f"got {self.got}" if self.got else "",
+            )
+            if part
+        )
+        sentences = [f"{self.where}: {self.what}" if self.where else self.what]
+        if found:
+            sentences.append(found[0].upper() + found[1:])
+        if self.remedy:
+            sentences.append(self.remedy)
+        return ". ".join(sentences) + "."
+
+
+class InputError(TractError):
+    """The user's input cannot be used; nothing was started."""
+
+    exit_code = 2
+
+
+class SourceError(InputError):
+    """A movie file is missing, damaged, or not a movie."""
+
+
+class SettingsError(InputError):
+    """A setting is out of range, unknown, or contradicts another."""
+
+
+class DestinationError(InputError):
+    """The place to write to holds something else or cannot be written."""
+
+
+class StoreError(TractError):
+    """A store is damaged, unfinished, or could not be written (a full disk)."""
+
+
+class ClusterError(TractError):
+    """The scheduler or its workers cannot do the work."""

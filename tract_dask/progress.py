@@ -1,0 +1,117 @@
+"""What a run tells the world: small event objects, and sinks that take them.
+
+A sink is any callable that takes one event. A run knows nothing of terminals, files or web pages; it calls its sink.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+
+
+@dataclass(frozen=True)
+class RunStarted:
+    """A run begins (or goes on)."""
+
+    source: str
+    output: str
+    dashboard: str = ""
+
+
+@dataclass(frozen=True)
+class StageStarted:
+    """A stage begins; ``done_frames`` of ``frames`` were finished by an earlier run."""
+
+    stage: str
+    frames: int
+    done_frames: int = 0
+    columns: int = 0
+    frame_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class ShardDone:
+    """One shard of a stage is computed, written and recorded."""
+
+    stage: str
+    shard: int
+    frames: int
+    fits: int = 0
+
+
+@dataclass(frozen=True)
+class StageDone:
+    """A stage is finished; ``reused`` when an earlier run had done all of it."""
+
+    stage: str
+    seconds: float
+    reused: bool = False
+    summary: str = ""
+
+
+@dataclass(frozen=True)
+class Warned:
+    """Something the user should know that does not stop the run."""
+
+    message: str
+
+
+@dataclass(frozen=True)
+class RunDone:
+    """The run ended; ``state`` is done, done_with_bad_frames, interrupted or failed."""
+
+    state: str
+    seconds: float
+    message: str = ""
+
+
+Event: TypeAlias = RunStarted | StageStarted | ShardDone | StageDone | Warned | RunDone
+Sink: TypeAlias = Callable[[Event], None]
+
+
+def silent(event: Event) -> None:
+    """Take an event and do nothing with it."""
+
+
+def to_record(event: Event) -> dict[str, Any]:
+    """Return an event as a flat, JSON-ready mapping with its type and the UTC time.
+
+    Examples
+    --------
+    >>> record = to_record(ShardDone("fit", 3, 16, 640))
+    >>> record["event"], record["shard"]
+    ('ShardDone', 3)
+    """
+    return {
+        "event": type(event).__name__,
+        "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        **dataclasses.asdict(event),
+    }
+
+
+class JsonLines:
+    """A sink that appends each event to a file as one line of JSON."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __call__(self, event: Event) -> None:
+        """Append one line; a line is written in one call, so a killed run leaves whole lines."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(to_record(event)) + "\n")
+
+
+def tee(sinks: Iterable[Sink]) -> Sink:
+    """Return one sink that passes each event to all of ``sinks``, in order."""
+    targets = tuple(sinks)
+
+    def send(event: Event) -> None:
+        for target in targets:
+            target(event)
+
+    return send

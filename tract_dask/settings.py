@@ -1,0 +1,355 @@
+"""Every setting of every stage: frozen dataclasses that check themselves, and their TOML form.
+
+A setting is declared once, here, with its default, unit, range and one sentence; the command line, the documentation
+and the checks come from that declaration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tomli_w
+
+from .errors import SettingsError
+
+T = TypeVar("T")
+
+
+def setting(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    flag: str = "",
+) -> Any:
+    """Declare a setting: a dataclass field that carries its documentation and its range.
+
+    ``flag`` names its option on the command line where that is not simply the field's name with dashes.
+    """
+    return field(
+        default=default,
+        metadata={
+            "description": description,
+            "unit": unit,
+            "low": low,
+            "high": high,
+            "choices": choices,
+            "flag": flag,
+        },
+    )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A group of settings; construction checks every value.
+
+    Raises
+    ------
+    SettingsError
+        Naming the setting, its range or choices, and the value found.
+    """
+
+    def __post_init__(self) -> None:
+        kinds = typing.get_type_hints(type(self))
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            value = tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
+            if isinstance(value, int) and not isinstance(value, bool) and _kind(kinds[item.name]) is float:
+                value = float(value)
+            object.__setattr__(self, item.name, value)
+            if not isinstance(value, Settings):
+                _check(type(self), item, kinds[item.name], value)
+
+
+@dataclass(frozen=True)
+class SourceSettings(Settings):
+    """How to read a file that does not say enough about itself."""
+
+    raw_shape: tuple[int, ...] | None = setting(
+        None,
+        "Frames, rows and columns of a raw binary file; frames 0 means as many as the file holds",
+        unit="px",
+    )
+    raw_dtype: str | None = setting(None, "Pixel type of a raw binary file, such as uint16 or >f4")
+    raw_offset: int = setting(0, "Bytes to skip at the start of a raw binary file", unit="bytes", low=0)
+
+
+@dataclass(frozen=True)
+class MetadataSettings(Settings):
+    """What the user knows better than the file; unset means as the file says."""
+
+    pixel_size_pm: float | None = setting(None, "Size of a pixel", unit="pm", low=1e-3, high=1e7)
+    frame_time_s: float | None = setting(None, "Time from one frame to the next", unit="s", low=1e-12, high=1e6)
+    dose: float | None = setting(None, "Electron dose of one frame", unit="e/A^2", low=0)
+    gain: float = setting(1.0, "Electron counts for one detector unit", unit="counts", low=1e-12, high=1e12)
+
+
+@dataclass(frozen=True)
+class ConvertSettings(Settings):
+    """The layout of movie.zarr."""
+
+    shard_mb: float = setting(
+        256.0, "Uncompressed size of a shard, the unit of writing and of work", unit="MB", low=1, high=4096
+    )
+    tile_px: int = setting(256, "Side of the tiles inside a shard", unit="px", low=16, high=8192)
+    codec: str = setting("lz4", "Lossless compression: lz4 is fast, zstd is smaller", choices=("lz4", "zstd", "none"))
+
+
+@dataclass(frozen=True)
+class DriftSettings(Settings):
+    """How the movement of the whole field is measured."""
+
+    method: str = setting(
+        "auto",
+        "Measure the drift, read it from a CSV file, or take it as zero",
+        choices=("auto", "csv", "none"),
+        flag="--drift",
+    )
+    csv: str | None = setting(
+        None, "CSV file with columns frame, y, x (drift in px), for method csv", flag="--drift-csv"
+    )
+    search_px: float | None = setting(
+        None,
+        "Largest step between two frames; unset: 0.4 of the shortest lattice period",
+        unit="px",
+        low=0.5,
+        flag="--drift-search-px",
+    )
+    refine: bool = setting(
+        True,
+        "Correct the drift of each frame by the common motion of its fitted columns",
+        flag="--drift-refine",
+    )
+    refine_columns: int = setting(10, "Fewest accepted columns of a frame for that correction", low=3)
+
+
+@dataclass(frozen=True)
+class ColumnSettings(Settings):
+    """How the atomic columns are found in the summed image."""
+
+    method: str = setting(
+        "auto",
+        "Find columns automatically, on lattices, or at the positions of a CSV file",
+        choices=("auto", "lattice", "csv"),
+        flag="--columns-method",
+    )
+    csv: str | None = setting(None, "CSV file with columns x, y and optionally column_id, kind", flag="--columns")
+    contrast: str = setting(
+        "bright", "Columns are brighter or darker than their surroundings", choices=("bright", "dark")
+    )
+    lattices: tuple[Any, ...] = setting(
+        (),
+        "Lattices for method lattice: origin, a, a_count, b, b_count (positions in px), a_repeats, b_repeats, kind",
+    )
+    spacing_px: float | None = setting(None, "Distance between neighbouring columns; unset: measured", unit="px", low=2)
+    search_radius_px: float | None = setting(
+        None, "Radius of the local maximum around a seed; unset: a quarter of the spacing", unit="px", low=0
+    )
+    centroid_radius_px: float | None = setting(
+        None, "Radius of the centroid around that maximum; unset: an eighth of the spacing", unit="px", low=1
+    )
+    min_amplitude: float = setting(
+        0.15,
+        "Weakest column that is kept, against the median amplitude",
+        low=0,
+        high=1,
+        flag="--min-amplitude",
+    )
+
+
+@dataclass(frozen=True)
+class FitSettings(Settings):
+    """How a column is fitted in every frame."""
+
+    window_px: int | None = setting(
+        None, "Side of the fitted window, odd; unset: half the spacing", unit="px", low=5, high=501
+    )
+    blur_sigma_px: float = setting(
+        2.0, "Gaussian blur before the fit (the paper's 2 px); 0 fits raw pixels", unit="px", low=0, high=20
+    )
+    max_shift_px: float | None = setting(
+        None,
+        "Farthest a column may be from its place in the summed image; unset: a quarter of the window",
+        unit="px",
+        low=0.1,
+    )
+    sigma_factor: float = setting(
+        1.3, "Sigmas stay within this factor of those in the summed image", low=1.01, high=100
+    )
+    amplitude_factor: float = setting(
+        5.0, "Amplitude stays below this factor of that in the summed image", low=1.01, high=1e6
+    )
+    threshold: float = setting(2.0, "Accept a fit where the amplitude exceeds this times the noise", low=0, high=100)
+    intensity_scale: str = setting(
+        "paper",
+        "Share of a Gaussian inside two sigma: the paper's box (0.9111) or the ellipse (0.8647)",
+        choices=("paper", "ellipse"),
+    )
+    vacuum_box: tuple[int, ...] | None = setting(
+        None,
+        "Empty region for the noise: y0, y1, x0, x1 in the summed image; unset: found automatically",
+        unit="px",
+    )
+    tolerance_px: float = setting(
+        1e-4, "A fit has converged when its position moves less than this", unit="px", low=1e-8, high=0.1
+    )
+    max_iterations: int = setting(50, "Most iterations of one fit", low=1, high=10000)
+
+
+@dataclass(frozen=True)
+class ClusterSettings(Settings):
+    """Where the work runs; no result depends on it."""
+
+    scheduler: str | None = setting(None, "Address of a running Dask scheduler")
+    scheduler_file: str | None = setting(None, "Scheduler file of a running Dask scheduler")
+    workers: int | None = setting(None, "Worker processes of the local cluster; unset: one a core", low=1, high=4096)
+    memory_limit: str | None = setting(
+        None, "Memory of each local worker, such as 2GB; unset: its share of the machine"
+    )
+
+
+@dataclass(frozen=True)
+class RunSettings(Settings):
+    """All settings of a run."""
+
+    source: SourceSettings = field(default_factory=SourceSettings)
+    metadata: MetadataSettings = field(default_factory=MetadataSettings)
+    convert: ConvertSettings = field(default_factory=ConvertSettings)
+    drift: DriftSettings = field(default_factory=DriftSettings)
+    columns: ColumnSettings = field(default_factory=ColumnSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
+
+
+def to_dict(settings: Settings) -> dict[str, Any]:
+    """Return the settings as nested mappings, without those that are unset."""
+    return {
+        item.name: to_dict(value) if isinstance(value, Settings) else value
+        for item in dataclasses.fields(settings)
+        if (value := getattr(settings, item.name)) is not None
+    }
+
+
+def to_toml(settings: Settings) -> str:
+    """Return the settings as TOML text.
+
+    Examples
+    --------
+    >>> from_toml(FitSettings, to_toml(FitSettings(window_px=31))).window_px
+    31
+    """
+    return tomli_w.dumps(to_dict(settings))
+
+
+def from_toml(kind: type[T], text: str, where: str = "settings") -> T:
+    """Return settings of class ``kind`` from TOML text.
+
+    Raises
+    ------
+    SettingsError
+        Where the text is not TOML, or names a setting that does not exist, or a value is out of range.
+    """
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(
+            "this is not valid TOML", where, got=str(error), remedy="Mend the line that it names"
+        ) from error
+    return from_dict(kind, values, where)
+
+
+def from_dict(kind: type[T], values: dict[str, Any], where: str = "settings") -> T:
+    """Return settings of class ``kind`` from nested mappings; see :func:`from_toml`."""
+    kinds = typing.get_type_hints(kind)
+    names = [item.name for item in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    arguments: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in names:
+            raise SettingsError(
+                f"there is no setting {name!r}",
+                where,
+                f"one of {', '.join(names)}",
+                name,
+                "Correct its name; docs/settings.md lists them all",
+            )
+        nested = isinstance(kinds[name], type) and issubclass(kinds[name], Settings)
+        if nested and not isinstance(value, dict):
+            raise SettingsError(
+                f"{name!r} is a group of settings", where, f"a table [{name}]", repr(value), "Give it a table"
+            )
+        arguments[name] = from_dict(kinds[name], value, f"{where} [{name}]") if nested else value
+    return kind(**arguments)
+
+
+def load(path: Path) -> RunSettings:
+    """Return the settings in a TOML file, such as the run.toml that every run writes.
+
+    Raises
+    ------
+    SettingsError
+        As :func:`from_toml`, and where the file cannot be read.
+    """
+    try:
+        return from_toml(RunSettings, path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(
+            "the settings file cannot be read", str(path), "a TOML file", str(error), "Check its path"
+        ) from error
+
+
+def _kind(annotation: Any) -> Any:
+    """Return the plain type behind ``X | None`` and ``tuple[...]``."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        annotation = next(arg for arg in typing.get_args(annotation) if arg is not type(None))
+    return typing.get_origin(annotation) or annotation
+
+
+def is_optional(annotation: Any) -> bool:
+    """Tell whether a setting's annotation admits None."""
+    return type(None) in typing.get_args(annotation)
+
+
+def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: Any) -> None:
+    meta = item.metadata
+    where = f"setting {item.name} ({owner.__name__})"
+    if value is None and is_optional(annotation):
+        return
+    kind = _kind(annotation)
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise SettingsError(
+            "the value is of the wrong type", where, kind.__name__, repr(value), meta.get("description", "")
+        )
+    if meta.get("choices") and value not in meta["choices"]:
+        raise SettingsError(
+            "there is no such choice",
+            where,
+            f"one of {', '.join(meta['choices'])}",
+            repr(value),
+            meta["description"],
+        )
+    low, high = meta.get("low"), meta.get("high")
+    if isinstance(value, int | float) and not ((low is None or value >= low) and (high is None or value <= high)):
+        bounds = " and ".join(
+            part
+            for part in (
+                f"at least {low:g}" if low is not None else "",
+                f"at most {high:g}" if high is not None else "",
+            )
+            if part
+        )
+        raise SettingsError(
+            "the value is out of range",
+            where,
+            f"{bounds} {meta['unit']}".strip(),
+            repr(value),
+            meta["description"],
+        )
