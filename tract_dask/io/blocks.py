@@ -1,0 +1,95 @@
+"""Frames that lie uncompressed in a file: straight from disk into the array that is returned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .source import NOTHING_KNOWN, Frames, Source, SourceMetadata, checked_dtype, checked_shape, truncated, unreadable
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockSource(Source):
+    """Frames at known places in one file.
+
+    Attributes
+    ----------
+    offsets
+        Position of each frame's first byte.
+    stored
+        Pixel type as stored, with its byte order.
+    """
+
+    offsets: NDArray[np.int64]
+    stored: np.dtype[Any]
+
+    def read(self, start: int, stop: int) -> Frames:
+        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
+        offsets = self.offsets[start:stop]
+        frames = np.empty((len(offsets), *self.shape[1:]), self.stored)
+        if not len(offsets):
+            return frames.view(self.dtype)
+        breaks = np.flatnonzero(np.diff(offsets) != frames[0].nbytes) + 1
+        try:
+            with self.files[0].open("rb", buffering=0) as file:
+                for first, last in pairwise((0, *breaks.tolist(), len(offsets))):
+                    _read_into(file, int(offsets[first]), frames[first:last], self.files[0])
+        except OSError as error:
+            raise unreadable(self.path, error) from error
+        if self.stored != self.dtype:
+            frames.byteswap(inplace=True)
+        return frames.view(self.dtype)
+
+
+def open_block(
+    path: Path,
+    *,
+    name: str,
+    shape: tuple[int, ...],
+    stored: np.dtype[Any],
+    offset: int,
+    metadata: SourceMetadata = NOTHING_KNOWN,
+) -> BlockSource:
+    """Return the frames that lie one after the other in a file from byte ``offset`` on.
+
+    Raises
+    ------
+    SourceError
+        Where the pixel type or the shape is unfit, or the file is too short.
+    """
+    dtype = checked_dtype(stored, str(path))
+    n_frames, n_y, n_x = checked_shape(shape, str(path))
+    frame_bytes = n_y * n_x * stored.itemsize
+    size = path.stat().st_size
+    if size < offset + n_frames * frame_bytes:
+        n_whole = max(0, size - offset) // frame_bytes
+        raise truncated(str(path), f"in frame {n_whole} of {n_frames}", offset + n_frames * frame_bytes, size)
+    return BlockSource(
+        path=str(path),
+        files=(path,),
+        format=name,
+        shape=(n_frames, n_y, n_x),
+        dtype=dtype,
+        metadata=metadata,
+        offsets=offset + frame_bytes * np.arange(n_frames, dtype=np.int64),
+        stored=stored,
+    )
+
+
+def _read_into(file: Any, offset: int, frames: Frames, path: Path) -> None:
+    """Fill ``frames`` from ``offset`` on; one call of the system reads at most 2 GB."""
+    target = frames.reshape(-1).view(np.uint8)
+    file.seek(offset)
+    done = 0
+    while done < len(target):
+        count = file.readinto(target[done:])
+        if not count:
+            raise truncated(
+                str(path), "before the frames that it held when it was opened", offset + len(target), offset + done
+            )
+        done += count
