@@ -1,0 +1,1 @@
+"""Numerical kernels: numpy and numba only, array in, array out."""
