@@ -1,0 +1,75 @@
+"""A stage that runs over the movie once or more often: its journals, its events, and the arrays its tasks leave."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from distributed import Client
+from numpy.typing import NDArray
+
+from .movie import Movie
+from .progress import ShardDone, Sink, StageDone, StageStarted
+from .shards import Journal, Payload, Shard, run_shards
+from .stores import disk_errors
+
+
+class Passes:
+    """The journals and events of one stage that runs over the movie once or more often."""
+
+    def __init__(
+        self, name: str, movie: Movie, on_event: Sink, folder: Path | None, client: Client | None, runs: int
+    ) -> None:
+        self.name, self.movie, self.on_event, self.client, self.runs = name, movie, on_event, client, runs
+        self._folder, self._stack, self._started, self._computed = folder, ExitStack(), perf_counter(), False
+
+    def __enter__(self) -> Passes:
+        if self._folder is None:
+            self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="tract_dask-")))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def journal(self, name: str, key: str) -> Journal:
+        """Return the journal of one of the stage's runs."""
+        assert self._folder is not None
+        return Journal(self._folder / name, key)
+
+    def begin(self, runs: list[tuple[Journal, tuple[Shard, ...]]]) -> None:
+        """Tell that the stage begins, and how much of it is done."""
+        done = sum(
+            shard.frames
+            for journal, shards in runs
+            for known in [journal.done()]
+            for shard in shards
+            if shard.index in known
+        )
+        frame_bytes = int(np.prod(self.movie.shape[1:])) * self.movie.dtype.itemsize
+        self.on_event(StageStarted(self.name, self.runs * self.movie.n_frames, done, 0, frame_bytes))
+
+    def run(self, task: Any, shards: tuple[Shard, ...], journal: Journal) -> dict[int, Payload]:
+        """Run the task on the shards that are not done; return the payloads of all."""
+
+        def tell(shard: Shard, payload: Payload) -> None:
+            self._computed = True
+            self.on_event(ShardDone(self.name, shard.index, shard.frames))
+
+        return run_shards(task, shards, journal=journal, name=self.name, client=self.client, on_done=tell)
+
+    def end(self, summary: str) -> None:
+        """Tell that the stage is done."""
+        self.on_event(StageDone(self.name, perf_counter() - self._started, not self._computed, summary))
+
+
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array as .npy, beside its place first, then renamed."""
+    aside = path.with_name(f".{path.stem}.{os.getpid()}.partial.npy")
+    with disk_errors(path):
+        np.save(aside, array)
+        aside.replace(path)
