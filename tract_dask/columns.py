@@ -1,0 +1,384 @@
+"""The columns stage: where the atomic columns are in the summed image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from . import schema
+from .errors import InputError, SettingsError
+from .kernels.filters import blur, cut_windows
+from .kernels.fitting import GaussianFits, fit_gaussians
+from .kernels.peaks import centroids, climb
+from .lattice import Lattice, damping, find_lattice, find_peaks, pixel_noise, relief
+from .schema import Status
+from .seeds import (
+    column_dataset,
+    lattice_columns,
+    positions,
+    read_columns_csv,
+    settings_lattices,
+    write_columns_csv,
+)
+from .settings import ColumnSettings
+
+__all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
+
+Places = NDArray[np.float64]
+AMPLITUDE, X, Y, SIGMA_A, SIGMA_B, THETA, BACKGROUND = range(len(schema.PARAMETERS))
+
+_SAME = 1 / 3
+"""Seeds nearer than this share of the spacing, after refinement, are one column."""
+_SIGNIFICANT = 3.0
+"""Amplitude, in standard deviations of the blurred image's noise, below which a column is flagged below_noise."""
+_SHAPE_FACTOR = 1.5
+"""A sigma beyond this factor of its median over the columns of the same kind is unusual; the fit is then repeated."""
+_SHAPE_MARGIN = 1.1
+"""With sigmas within this factor of the median."""
+_FEWEST_FOR_SHAPE = 5
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``."""
+
+    counts: NDArray[np.float64]
+    image: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    sign: int
+    noise: float
+    blur_sigma_px: float
+
+    @property
+    def blurred(self) -> NDArray[np.float32]:
+        return blur(self.image, self.blur_sigma_px)
+
+    @property
+    def blurred_noise(self) -> float:
+        return self.noise * damping(self.blur_sigma_px)
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Where to look: (n, 2) of (x, y), kinds, numbers to report them by; ``fixed``: the numbers stay as IDs."""
+
+    places: Places
+    kind: NDArray[np.str_]
+    number: NDArray[np.int64]
+    fixed: bool
+
+
+def find_columns(
+    summed: xr.Dataset,
+    settings: ColumnSettings | None = None,
+    *,
+    seeds: xr.Dataset | None = None,
+    blur_sigma_px: float = 2.0,
+    window_px: int | None = None,
+) -> xr.Dataset:
+    """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
+
+    Seeds come from the image (method ``auto``, see :func:`tract_dask.lattice.find_peaks`), from lattices of three atoms
+    (``lattice``, see :func:`lattice_columns`) or from a file (``csv``). Each moves to the local maximum within the
+    search radius, then to the centroid around that, and there Equation 1 is fitted.
+
+    Parameters
+    ----------
+    summed
+        From :func:`tract_dask.sum_image`.
+    settings
+        Defaults to automatic columns, bright.
+    seeds
+        Columns to start from, as :func:`lattice_columns` and :func:`read_columns_csv` return them and as you may have
+        changed them; they take the place of the method, and keep their IDs.
+    blur_sigma_px, window_px
+        As in the fit of the frames, px. The window's default is half the columns' spacing, odd.
+
+    Returns
+    -------
+    xr.Dataset
+        As declared in :data:`schema.COLUMNS`. Columns found automatically or on lattices are numbered from 1, row by
+        row from the top and by x within a row (the columns no more than a third of the spacing below a row's first);
+        those from a file or ``seeds`` keep their order and IDs. A column whose window leaves the exposed part of the
+        image is kept where its seed was, with the flag outside_frame and without a fit. Attributes: spacing_px (median
+        distance to the nearest neighbour), window_px, contrast, blur_sigma_px, pixel_size_pm, n_seeds, and merged:
+        pairs of a column's ID and the number of a later seed that refined to the same column and was dropped. (A seed's
+        number is its ID, or its place in the list of seeds, from 1: automatic ones are listed strongest first, those of
+        lattices lattice by lattice, without the sites beyond the image.)
+
+    Raises
+    ------
+    SettingsError
+        Where lattices, file or window cannot be used, or seeds of a file lie outside the image.
+    InputError
+        Where there is no column.
+    """
+    settings = settings or ColumnSettings()
+    schema.validate(summed, schema.SUM, "summed image")
+    scene = _scene(summed, settings, blur_sigma_px)
+    found, spacing = _seeds(scene, settings, seeds)
+    window = _window(window_px, spacing, scene.image.shape)
+    search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
+    centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
+    raised, _ = relief(scene.image, spacing, blur_sigma_px)
+    places = centroids(raised, climb(raised, found.places, search), centroid)
+    inside, corner = _corners(places, window, scene.valid)
+    places = np.where(inside[:, None], places, found.places)
+    fit, status = _fit(scene, places, corner, inside, found.kind, window, max(search, 1.0))
+    fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
+    places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], places)
+    twins = _twins(places, _SAME * spacing)
+    kept = np.setdiff1d(np.arange(len(places)), list(twins))
+    kept = kept if found.fixed else kept[_reading_order(places[kept], spacing / 3)]
+    ids = found.number[kept] if found.fixed else np.arange(1, len(kept) + 1)
+    columns = column_dataset(places[kept], found.kind[kept].tolist(), ids, fit[kept], status[kept])
+    name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
+    columns.attrs = {
+        "spacing_px": _neighbour_distance(places[kept]) or spacing,
+        "window_px": window,
+        "contrast": settings.contrast,
+        "blur_sigma_px": float(blur_sigma_px),
+        "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
+        "n_seeds": len(found.number),
+        "merged": sorted([name[first], int(found.number[twin])] for twin, first in twins.items()),
+    }
+    return columns
+
+
+def _scene(summed: xr.Dataset, settings: ColumnSettings, blur_sigma_px: float) -> _Scene:
+    counts = summed["image"].to_numpy().astype(np.float64)
+    valid = np.isfinite(counts) & (summed["exposure"].to_numpy() > 0)
+    if not valid.any():
+        raise InputError(
+            "the summed image is empty", "columns", "exposed pixels", "none", "Check the drift: it may leave no overlap"
+        )
+    counts[~valid] = np.median(counts[valid])
+    sign = 1 if settings.contrast == "bright" else -1
+    return _Scene(counts, sign * counts, valid, sign, pixel_noise(counts, valid), blur_sigma_px)
+
+
+def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) -> tuple[_Seeds, float]:
+    """Return the seeds and their spacing in px."""
+    if given is None and settings.method == "auto":
+        return _automatic(scene, settings)
+    if given is None and settings.method == "lattice":
+        return _on_lattices(scene, settings)
+    where = "seeds"
+    if given is None:
+        if settings.csv is None:
+            raise SettingsError(
+                "there is no file to take the columns from",
+                "setting csv (ColumnSettings)",
+                "the path of a CSV file for method csv",
+                "none",
+                "Give it, or choose method auto",
+            )
+        given, where = read_columns_csv(settings.csv), settings.csv
+    seeds = _Seeds(positions(given), given["kind"].to_numpy().astype(np.str_), given["column_id"].to_numpy(), True)
+    _check_inside(seeds, scene.valid.shape, where)
+    measured = (
+        None if settings.spacing_px else _neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing
+    )
+    return seeds, settings.spacing_px or measured or 0.0
+
+
+def _automatic(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
+    if settings.spacing_px is None:
+        lattice: Lattice | None = _lattice_of(scene, settings)
+    else:
+        lattice = find_lattice(scene.blurred, scene.valid, scene.blurred_noise, settings.spacing_px)
+    spacing = lattice.spacing if lattice else float(settings.spacing_px or 0)
+    raised, share = relief(scene.image, spacing, scene.blur_sigma_px)
+    places = find_peaks(raised, scene.valid, lattice, spacing, share * scene.noise, settings.min_amplitude)
+    if not len(places):
+        raise InputError(
+            "no column stands out of the noise",
+            "columns",
+            f"columns {'brighter' if scene.sign > 0 else 'darker'} than their surroundings",
+            "none",
+            f"Check the contrast (now {settings.contrast}) and spacing_px, or give the columns in a CSV file",
+        )
+    number = np.arange(1, len(places) + 1)
+    return _Seeds(places, np.full(len(places), ""), number, False), _neighbour_distance(places) or spacing
+
+
+def _lattice_of(scene: _Scene, settings: ColumnSettings) -> Lattice:
+    lattice = find_lattice(scene.blurred, scene.valid, scene.blurred_noise)
+    if lattice is None:
+        raise InputError(
+            "the summed image shows no lattice, so the distance between columns is not known",
+            "columns",
+            "a periodic image",
+            "none of its shifts matches it",
+            f"Give spacing_px, or a CSV file, and check the contrast (now {settings.contrast}) and the drift",
+        )
+    return lattice
+
+
+def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
+    """Return the sites of all lattices inside the image; a site that two lattices share belongs to the first."""
+    lattices = settings_lattices(settings.lattices)
+    places = np.concatenate([positions(lattice) for lattice in lattices])
+    kind = np.concatenate([lattice["kind"].to_numpy() for lattice in lattices])
+    size = np.array(scene.valid.shape[::-1])
+    inside = ((places >= -0.5) & (places < size - 0.5)).all(axis=1)
+    if not inside.any():
+        raise SettingsError(
+            "no site of the lattices is inside the image",
+            "setting lattices (ColumnSettings)",
+            f"positions (x, y) from 0 to {size[0] - 1}, {size[1] - 1}",
+            f"the first at ({places[0, 0]:g}, {places[0, 1]:g})",
+            "Give positions in px of the summed image, x to the right and y down",
+        )
+    seeds = _Seeds(places[inside], kind[inside], np.arange(1, inside.sum() + 1), False)
+    finest = settings.spacing_px or min(lattice.attrs["spacing_px"] for lattice in lattices)
+    shared = _twins(seeds.places, _SAME * finest)
+    distinct = np.delete(seeds.places, list(shared), axis=0)
+    return seeds, settings.spacing_px or _neighbour_distance(distinct) or finest
+
+
+def _check_inside(seeds: _Seeds, shape: tuple[int, ...], where: str) -> None:
+    size = np.array(shape[::-1])
+    outside = np.flatnonzero(~((seeds.places >= -0.5) & (seeds.places < size - 0.5)).all(axis=1))
+    if len(outside):
+        first = int(outside[0])
+        x, y = seeds.places[first]
+        raise SettingsError(
+            f"{len(outside)} of {len(seeds.places)} columns lie outside the image",
+            where,
+            f"x from 0 to {size[0] - 1}, y from 0 to {size[1] - 1}",
+            f"column {seeds.number[first]} at x {x:g}, y {y:g}" + (" first" if len(outside) > 1 else ""),
+            "Give positions in px of the summed image (check that x and y are not exchanged), or remove these columns",
+        )
+
+
+def _window(window_px: int | None, spacing: float, shape: tuple[int, ...]) -> int:
+    window = window_px or max(7, 2 * round(0.25 * spacing) + 1)
+    if window % 2 == 0 or window < 5 or window > min(shape):
+        raise SettingsError(
+            "the window cannot be used",
+            "setting window_px (FitSettings)",
+            f"an odd number from 5 to {min(shape)}, the shorter side of the image",
+            f"{window}" + ("" if window_px else f", from a spacing of {spacing:.4g} px"),
+            "Give window_px, or spacing_px if that spacing is wrong",
+        )
+    return window
+
+
+def _corners(places: Places, window: int, valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return whether each window is wholly on exposed pixels, and its first pixel (x, y)."""
+    corner = np.rint(places).astype(np.int64) - window // 2
+    inside = np.all((corner >= 0) & (corner + window <= np.array(valid.shape[::-1])), axis=1)
+    for column in np.flatnonzero(inside):
+        x, y = corner[column]
+        inside[column] = valid[y : y + window, x : x + window].all()
+    return inside, corner
+
+
+def _fit(
+    scene: _Scene,
+    places: Places,
+    corner: NDArray[np.int64],
+    inside: NDArray[np.bool_],
+    kind: NDArray[np.str_],
+    window: int,
+    search: float,
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return (n, 7) fits, NaN where the window leaves the image, and (n,) flags.
+
+    What a first fit makes of a weak column may reach out to its neighbours. Where its shape is unusual for its kind, it
+    is fitted again with about the usual one (mostly flagged at_bound), as the paper bounds fits by its columns' size.
+    """
+    fit = np.full((len(places), 7), np.nan)
+    status = np.where(inside, 0, Status.OUTSIDE_FRAME).astype(np.uint8)
+    if not inside.any():
+        return fit, status
+    x, y = corner[inside].T
+    windows = cut_windows(scene.counts[None], y[None], x[None], window, scene.blur_sigma_px)[0]
+    start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
+    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200}
+    fits = fit_gaussians(windows, start, lower, upper, **options)
+    odd = _odd_shapes(fits, kind[inside], start, lower, upper)
+    if odd.any():
+        again = fit_gaussians(windows[odd], start[odd], lower[odd], upper[odd], **options)
+        for name in ("estimates", "converged", "at_bound"):
+            getattr(fits, name)[odd] = getattr(again, name)
+    fit[inside] = fits.estimates
+    fit[inside, X] += x
+    fit[inside, Y] += y
+    weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.blurred_noise)
+    flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: ~fits.converged, Status.AT_BOUND: fits.at_bound}
+    for flag, found in flags.items():
+        status[inside] |= np.where(found, flag, Status.OK).astype(np.uint8)
+    return fit, status
+
+
+def _odd_shapes(
+    fits: GaussianFits, kind: NDArray[np.str_], start: Places, lower: Places, upper: Places
+) -> NDArray[np.bool_]:
+    """Return which fits failed or are of a shape unusual for their kind; bind theirs to the usual one, in place."""
+    odd = np.zeros(len(kind), dtype=bool)
+    for name in np.unique(kind):
+        same = kind == name
+        if same.sum() < _FEWEST_FOR_SHAPE:
+            continue
+        usual = np.nanmedian(fits.estimates[same][:, [SIGMA_A, SIGMA_B]], axis=0)
+        too_wide = fits.estimates[:, SIGMA_A] > usual[0] * _SHAPE_FACTOR
+        too_narrow = fits.estimates[:, SIGMA_B] < usual[1] / _SHAPE_FACTOR
+        some = same & (too_wide | too_narrow | ~fits.converged)
+        start[some, SIGMA_A : SIGMA_B + 1] = usual
+        lower[some, SIGMA_A : SIGMA_B + 1] = usual[1] / _SHAPE_MARGIN
+        upper[some, SIGMA_A : SIGMA_B + 1] = usual[0] * _SHAPE_MARGIN
+        odd |= some
+    return odd
+
+
+def _bounds(windows: NDArray[np.float32], at: Places, sign: int, search: float) -> tuple[Places, Places, Places]:
+    """Return start values and bounds, each (n, 7): the amplitude has the contrast's sign, sigmas fit the window."""
+    n, size, _ = windows.shape
+    low, high = windows.min(axis=(1, 2)).astype(np.float64), windows.max(axis=(1, 2)).astype(np.float64)
+    span = high - low + 1e-12
+    start, lower, upper = np.zeros((3, n, 7))
+    surroundings = np.quantile(windows, 0.25 if sign > 0 else 0.75, axis=(1, 2))
+    start[:, AMPLITUDE] = sign * 0.8 * span
+    start[:, [X, Y]], start[:, BACKGROUND] = at, surroundings
+    start[:, SIGMA_A], start[:, SIGMA_B] = size / 5, size / 5
+    lower[:, AMPLITUDE], upper[:, AMPLITUDE] = np.sort([0 * span, sign * 5 * span], axis=0)
+    lower[:, [X, Y]], upper[:, [X, Y]] = at - search, at + search
+    lower[:, [SIGMA_A, SIGMA_B]], upper[:, [SIGMA_A, SIGMA_B]] = 0.5, size
+    lower[:, THETA], upper[:, THETA] = -np.inf, np.inf
+    lower[:, BACKGROUND], upper[:, BACKGROUND] = low - 5 * span, high + 5 * span
+    return start, lower, upper
+
+
+def _twins(places: Places, distance: float) -> dict[int, int]:
+    """Return which places to drop, each with the one that stands for it: an earlier one within ``distance``."""
+    twins: dict[int, int] = {}
+    for first, second in sorted(map(sorted, cKDTree(places).query_pairs(distance, output_type="ndarray").tolist())):
+        if first not in twins:
+            twins.setdefault(second, first)
+    return twins
+
+
+def _reading_order(places: Places, thickness: float) -> NDArray[np.int64]:
+    """Return the order by rows from the top, then by x; a row reaches ``thickness`` px below its topmost place."""
+    row = np.zeros(len(places), dtype=np.int64)
+    top, current = -np.inf, -1
+    for place in np.lexsort((places[:, 0], places[:, 1])):
+        if places[place, 1] > top + thickness:
+            top, current = places[place, 1], current + 1
+        row[place] = current
+    return np.lexsort((places[:, 0], row))
+
+
+def _neighbour_distance(places: Places) -> float | None:
+    """Return the median distance to the nearest neighbour, px; None for a single place."""
+    if len(places) < 2:
+        return None
+    distances = np.asarray(cKDTree(places).query(places, k=2)[0])
+    return float(np.median(distances[:, 1])) or None

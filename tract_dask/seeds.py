@@ -1,0 +1,293 @@
+"""Where to look for columns when the user says so: lattices made from three atoms, and CSV files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from . import schema
+from .errors import SettingsError
+from .schema import Status
+
+_FIT_COLUMNS = tuple(name for name in schema.PARAMETERS if name not in ("x", "y"))
+_LATTICE_KEYS = ("origin", "a", "a_count", "b", "b_count", "a_repeats", "b_repeats", "kind")
+
+
+def column_dataset(
+    places: ArrayLike,
+    kind: Sequence[str] | str = "",
+    column_id: ArrayLike | None = None,
+    fit: ArrayLike | None = None,
+    status: ArrayLike | None = None,
+) -> xr.Dataset:
+    """Return a Dataset of columns as declared in :data:`schema.COLUMNS`.
+
+    Parameters
+    ----------
+    places
+        (columns, 2) rows of (x, y) in px.
+    kind
+        One for each column, or one for all.
+    column_id
+        From 1 on, where it is not given.
+    fit, status
+        (columns, 7) fit on the summed image, NaN where there is none, and (columns,) its flags.
+    """
+    xy = np.asarray(places, dtype=np.float64).reshape(-1, 2)
+    kinds = [kind] * len(xy) if isinstance(kind, str) else list(kind)
+    values: dict[str, Any] = {
+        "x_ref": xy[:, 0].copy(),
+        "y_ref": xy[:, 1].copy(),
+        "kind": np.array(kinds, dtype=np.str_),
+        "fit_ref": np.full((len(xy), len(schema.PARAMETERS)), np.nan) if fit is None else np.asarray(fit, np.float64),
+        "status_ref": np.zeros(len(xy), np.uint8) if status is None else np.asarray(status, np.uint8),
+    }
+    ids = np.arange(1, len(xy) + 1) if column_id is None else np.asarray(column_id)
+    dataset = xr.Dataset(
+        {name: (schema.COLUMNS[name].dims, value, schema.COLUMNS[name].attributes) for name, value in values.items()},
+        {"column_id": ids.astype(np.int64), "parameter": list(schema.PARAMETERS)},
+    )
+    dataset["status_ref"].attrs |= schema.STATUS_ATTRIBUTES
+    return dataset.assign_coords(unit=("parameter", list(schema.PARAMETER_UNITS)))
+
+
+def positions(columns: xr.Dataset) -> NDArray[np.float64]:
+    """Return the places of columns as (columns, 2) rows of (x, y) in px."""
+    return np.stack([columns["x_ref"].to_numpy(), columns["y_ref"].to_numpy()], axis=1).astype(np.float64)
+
+
+def lattice_columns(
+    origin: Sequence[float],
+    a: Sequence[float],
+    a_count: int,
+    b: Sequence[float],
+    b_count: int,
+    a_repeats: int = 1,
+    b_repeats: int = 1,
+    kind: str = "",
+) -> xr.Dataset:
+    """Return the columns of a lattice that three atoms of the image define, as seeds for ``find_columns``.
+
+    The columns are ``origin + i (a - origin) / a_count + j (b - origin) / b_count`` for i = 0 ... a_repeats - 1 and
+    j = 0 ... b_repeats - 1, i running fastest: ``a_repeats * b_repeats`` columns, the first of them the origin. Where
+    the a-atom lies to the left of or above the origin, the lattice runs to the left or upwards.
+
+    Parameters
+    ----------
+    origin, a, b
+        Positions (x, y) of three atoms in px.
+    a_count, b_count
+        Columns from the origin to the a-atom and to the b-atom, the origin not counted: the farther away the atom, the
+        more precise the lattice.
+    a_repeats, b_repeats
+        Columns along each direction, the origin counted.
+    kind
+        Sublattice or element of all of them.
+
+    Raises
+    ------
+    SettingsError
+        Where a position is not two finite numbers, a count or repeat is not a whole number from 1 on, or the three
+        atoms lie on one line.
+
+    Examples
+    --------
+    >>> seeds = lattice_columns((10, 10), (90, 10), 4, (10, 70), 3, a_repeats=3, b_repeats=2)
+    >>> seeds.x_ref.values
+    array([10., 30., 50., 10., 30., 50.])
+    """
+    where = "lattice"
+    start, to_a, to_b = (_position(value, name, where) for value, name in ((origin, "origin"), (a, "a"), (b, "b")))
+    counts = {"a_count": a_count, "b_count": b_count, "a_repeats": a_repeats, "b_repeats": b_repeats}
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise SettingsError(f"{name} cannot be used", where, "a whole number from 1 on", repr(count))
+    if not isinstance(kind, str):
+        raise SettingsError("kind cannot be used", where, "text", repr(kind))
+    step_a, step_b = (to_a - start) / a_count, (to_b - start) / b_count
+    area = abs(step_a[0] * step_b[1] - step_a[1] * step_b[0])
+    if area <= 1e-3 * np.hypot(*step_a) * np.hypot(*step_b):
+        raise SettingsError(
+            "the three atoms lie on one line",
+            where,
+            "an origin, an a-atom and a b-atom in two directions",
+            f"origin {tuple(origin)}, a {tuple(a)}, b {tuple(b)}",
+            "Choose a b-atom off the line from the origin to the a-atom",
+        )
+    j, i = np.divmod(np.arange(a_repeats * b_repeats), a_repeats)
+    seeds = column_dataset(start + i[:, None] * step_a + j[:, None] * step_b, kind)
+    seeds.attrs["spacing_px"] = float(min(np.hypot(*v) for v in (step_a, step_b, step_a + step_b, step_a - step_b)))
+    return seeds
+
+
+def _position(value: Any, name: str, where: str) -> NDArray[np.float64]:
+    try:
+        position = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        position = np.empty(0)
+    if position.shape != (2,) or not np.isfinite(position).all():
+        raise SettingsError(f"{name} is not a position", where, "two numbers [x, y] in px", repr(value))
+    return position
+
+
+def settings_lattices(lattices: Sequence[Any]) -> list[xr.Dataset]:
+    """Return the columns of each lattice of the settings: tables with the arguments of :func:`lattice_columns`.
+
+    Raises
+    ------
+    SettingsError
+        Naming the lattice, counted from 1, and what is wrong with it.
+    """
+    if not lattices:
+        raise SettingsError(
+            "there is no lattice",
+            "setting lattices (ColumnSettings)",
+            "one table [[columns.lattices]] or more",
+            "none",
+            "Give origin, a, a_count, b, b_count and the repeats, or choose method auto",
+        )
+    found = []
+    for number, table in enumerate(lattices, start=1):
+        where = f"setting lattices (ColumnSettings), lattice {number}"
+        if not isinstance(table, Mapping):
+            raise SettingsError("this is not a table", where, f"the keys {', '.join(_LATTICE_KEYS)}", repr(table))
+        unknown = [str(key) for key in table if key not in _LATTICE_KEYS]
+        missing = [key for key in _LATTICE_KEYS[:5] if key not in table]
+        if unknown or missing:
+            got = [f"without {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
+            raise SettingsError(
+                "the keys are not those of a lattice",
+                where,
+                f"{', '.join(_LATTICE_KEYS[:5])}, and if need be {', '.join(_LATTICE_KEYS[5:])}",
+                "; ".join(got),
+            )
+        try:
+            found.append(lattice_columns(**table))
+        except SettingsError as error:
+            raise SettingsError(error.what, where, error.expected, error.got, error.remedy) from None
+    return found
+
+
+def write_columns_csv(columns: xr.Dataset, path: str | Path) -> None:
+    """Write columns as CSV: column_id, x, y, kind, the fit's other parameters, and the flags by name.
+
+    Numbers keep their full precision; :func:`read_columns_csv` gives back what was written.
+    """
+    fits = columns["fit_ref"].sel(parameter=list(_FIT_COLUMNS)).to_numpy()
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["column_id", "x", "y", "kind", *_FIT_COLUMNS, "flags"])
+        for column, (x, y), kind, fit, status in zip(
+            columns["column_id"].to_numpy(),
+            positions(columns),
+            columns["kind"].to_numpy(),
+            fits,
+            columns["status_ref"].to_numpy(),
+            strict=True,
+        ):
+            numbers = [repr(float(value)) if np.isfinite(value) else "" for value in fit]
+            flags = " ".join(str(flag.name).lower() for flag in Status if flag and int(status) & flag)
+            writer.writerow([int(column), repr(float(x)), repr(float(y)), str(kind), *numbers, flags])
+
+
+def read_columns_csv(path: str | Path) -> xr.Dataset:
+    """Return the columns of a CSV file.
+
+    Its first line names the columns: ``x`` and ``y`` (px) must be there, ``column_id`` (whole numbers from 0 on, each
+    once) and ``kind`` may be; a fit and flags are read where :func:`write_columns_csv` has written them, others are
+    ignored. Without IDs the columns are numbered from 1 in the order of the file. Empty lines and those that begin
+    with ``#`` are skipped.
+
+    Raises
+    ------
+    SettingsError
+        Where the file cannot be read or is empty, x or y is missing, a number is none, or an ID comes twice; naming
+        the line.
+    """
+    header, rows = _read_rows(path)
+    numbers = [_Row(path, line, dict(zip(header, row, strict=False))) for line, row in rows]
+    places = [[row.number("x"), row.number("y")] for row in numbers]
+    ids = [row.integer("column_id") for row in numbers] if "column_id" in header else None
+    first: dict[int, int] = {}
+    for row, column in zip(numbers, ids or (), strict=False):
+        if column in first:
+            raise SettingsError(
+                "a column_id comes twice",
+                f"{path}, line {row.line}",
+                "each column_id once",
+                f"{column}, as in line {first[column]}",
+                "Number the columns anew, or leave column_id out",
+            )
+        first[column] = row.line
+    fit = np.full((len(numbers), len(schema.PARAMETERS)), np.nan)
+    if set(_FIT_COLUMNS) <= set(header):
+        for row, values, place in zip(numbers, fit, places, strict=True):
+            if row.values["amplitude"]:
+                found = {name: row.number(name) for name in _FIT_COLUMNS} | {"x": place[0], "y": place[1]}
+                values[:] = [found[name] for name in schema.PARAMETERS]
+    kinds = [row.values.get("kind", "") for row in numbers]
+    return column_dataset(places, kinds, ids, fit, [row.flags() for row in numbers])
+
+
+def _read_rows(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the names of a CSV file's columns and its (line, values), stripped; x, y and one row are there."""
+    try:
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file)
+            lines = [(reader.line_num, [value.strip() for value in row]) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SettingsError(
+            "the columns file cannot be read", str(path), "a CSV file", str(error), "Check its path and format"
+        ) from error
+    lines = [(line, row) for line, row in lines if any(row) and not row[0].startswith("#")]
+    header = lines[0][1] if lines else []
+    if not lines or not {"x", "y"} <= set(header):
+        raise SettingsError(
+            "the columns file does not say where the columns are" if lines else "the columns file is empty",
+            f"{path}, line {lines[0][0]}" if lines else str(path),
+            "a first line that names the columns x and y, separated by commas",
+            ", ".join(header) or "no line",
+            "Name them in the first line: x,y or column_id,x,y,kind",
+        )
+    if len(lines) == 1:
+        raise SettingsError("the columns file is empty", str(path), "a row for each column", "the first line alone")
+    return header, lines[1:]
+
+
+class _Row:
+    """One row of a CSV file that knows its line."""
+
+    def __init__(self, path: str | Path, line: int, values: dict[str, str]) -> None:
+        self.path, self.line, self.values = path, line, values
+
+    def number(self, name: str) -> float:
+        try:
+            value = float(self.values.get(name, ""))
+        except ValueError:
+            value = float("nan")
+        if not np.isfinite(value):
+            raise self._error(name, "a number")
+        return value
+
+    def integer(self, name: str) -> int:
+        text = self.values.get(name, "")
+        if not (text.isascii() and text.isdigit() and len(text) < 19):
+            raise self._error(name, "a whole number from 0 on")
+        return int(text)
+
+    def flags(self) -> int:
+        names = {str(flag.name).lower(): int(flag) for flag in Status if flag}
+        found = self.values.get("flags", "").split()
+        if not set(found) <= set(names):
+            raise self._error("flags", f"some of {', '.join(names)}")
+        return sum(names[name] for name in set(found))
+
+    def _error(self, name: str, expected: str) -> SettingsError:
+        got = repr(self.values[name]) if name in self.values else "nothing"
+        return SettingsError(f"{name} cannot be read", f"{self.path}, line {self.line}", expected, got, "Correct it")
