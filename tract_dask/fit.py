@@ -1,0 +1,291 @@
+"""The fit stage: every column of every frame, one task a shard; into results.zarr, or lazily for a notebook."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from distributed import Client
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from . import results, schema, stores
+from .errors import SettingsError
+from .measure import Floats, Job, measure
+from .movie import Movie, open_movie
+from .progress import ShardDone, Sink, StageDone, StageStarted, silent
+from .provenance import provenance, stage_key
+from .schema import REJECTED, Status, X, Y
+from .settings import FitSettings, from_toml
+from .shards import Journal, Payload, Shard, journal_beside, run_shards
+from .vacuum import check_box, find_vacuum
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """What the fit stage did: numbers of fits, of accepted ones, and of frames that could not be fitted."""
+
+    fits: int
+    accepted: int
+    bad_frames: int
+
+
+def fit_columns(
+    movie: Movie,
+    columns: xr.Dataset,
+    drift: xr.Dataset | None = None,
+    settings: FitSettings | None = None,
+    *,
+    summed: xr.Dataset | None = None,
+    refine_columns: int | None = 10,
+) -> xr.Dataset:
+    """Fit every column in every frame, lazily: the Dataset computes what is asked of it, shard by shard.
+
+    Parameters
+    ----------
+    movie
+        An opened movie.
+    columns
+        From :func:`tract_dask.find_columns`.
+    drift
+        From :func:`tract_dask.estimate_drift`; None means none.
+    settings
+        Defaults to the paper's.
+    summed
+        From :func:`tract_dask.sum_image`; the vacuum for the noise is looked for in it. Without it, and without
+        ``settings.vacuum_box``, the noise of a frame is the rms residual of its fits.
+    refine_columns
+        Fewest accepted columns that may refine a frame's drift by their common motion; None: never.
+
+    Returns
+    -------
+    xr.Dataset
+        As declared in :data:`schema.RESULTS`, with the columns and coordinates; x and y in px, drift-corrected.
+
+    Raises
+    ------
+    SettingsError
+        Where a window is larger than the frame, or the vacuum box leaves it.
+    """
+    job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed, refine_columns=refine_columns)
+    n_columns = len(job.reference)
+    names = [name for name in schema.RESULTS if name not in ("time", "drift_measured")]
+    sizes = {"frame": movie.n_frames, "column_id": n_columns, "parameter": len(schema.PARAMETERS), "axis": 2}
+    chunk = {shard.index: shard for shard in movie.shards}
+
+    def fit_packed(index: NDArray[np.int64]) -> Floats:
+        values = measure(movie, chunk[int(index[0])], job)
+        return np.concatenate(
+            [values[name].reshape(len(values["noise"]), -1) for name in names], axis=1, dtype=np.float64
+        )
+
+    width = sum(int(np.prod([sizes[dim] for dim in schema.RESULTS[name].dims[1:]], dtype=int)) for name in names)
+    packed = da.map_blocks(
+        fit_packed,
+        da.arange(len(chunk), chunks=1),
+        new_axis=1,
+        chunks=(tuple(shard.frames for shard in movie.shards), (width,)),
+        dtype=np.float64,
+        name=False,
+    )
+    variables: dict[str, Any] = {}
+    offset = 0
+    for name in names:
+        variable = schema.RESULTS[name]
+        tail = tuple(sizes[dim] for dim in variable.dims[1:])
+        count = int(np.prod(tail, dtype=int))
+        block = packed[:, offset : offset + count].reshape((movie.n_frames, *tail))
+        variables[name] = (variable.dims, block.astype(variable.dtype), variable.attributes)
+        offset += count
+    dataset = columns.assign_coords(schema.coordinates(movie.n_frames)).assign(variables)
+    dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
+    dataset["time"] = ("frame", frame_times(movie), schema.RESULTS["time"].attributes)
+    dataset.attrs = {"pixel_size_pm": movie.pixel_size_pm, "frame_time_s": movie.frame_time_s, "dose": movie.dose}
+    return dataset
+
+
+def fit_movie(
+    movie: Movie,
+    columns: xr.Dataset,
+    drift: xr.Dataset | None,
+    path: Path,
+    settings: FitSettings | None = None,
+    *,
+    summed: xr.Dataset | None = None,
+    refine_columns: int | None = 10,
+    client: Client | None = None,
+    on_event: Sink = silent,
+) -> FitSummary:
+    """Fit every column in every frame into the store at ``path``; go on where an earlier call stopped.
+
+    The arguments are those of :func:`fit_columns`. A finished store with the same key is left as it is; one with
+    another key is made anew.
+    """
+    started = perf_counter()
+    settings = settings or FitSettings()
+    job = prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
+    key = fit_key(movie, columns, job)
+    about = stores.attributes(path)
+    n_columns = len(job.reference)
+    if about.get("key") == key and about.get("complete"):
+        stores.update_attributes(path, **_calibration(movie))
+        on_event(StageDone("fit", 0.0, reused=True))
+        return FitSummary(**about["summary"])
+    if about.get("key") != key:
+        stores.remove(journal_beside(path))
+        results.create(
+            path,
+            columns,
+            job.drift,
+            frame_times(movie),
+            movie.shards[0].frames,
+            **provenance(key, settings, str(movie.path)),
+            **_calibration(movie),
+            window=job.window,
+            vacuum=job.vacuum,
+            refine_columns=job.refine_columns,
+        )
+    journal = Journal(journal_beside(path), key)
+    done = journal.done()
+    done_frames = sum(shard.frames for shard in movie.shards if shard.index in done)
+    frame_bytes = int(np.prod(movie.shape[1:])) * movie.dtype.itemsize
+    on_event(StageStarted("fit", movie.n_frames, done_frames, n_columns, frame_bytes))
+    payloads = run_shards(
+        partial(_fit_task, movie.path, path, key),
+        movie.shards,
+        journal=journal,
+        name="fit",
+        client=client,
+        on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
+    )
+    summary = {name: sum(int(p[name]) for p in payloads.values()) for name in ("fits", "accepted", "bad_frames")}
+    stores.update_attributes(path, complete=True, summary=summary)
+    journal.remove()
+    on_event(
+        StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
+    )
+    return FitSummary(**summary)
+
+
+def prepare(
+    movie: Movie,
+    columns: xr.Dataset,
+    drift: xr.Dataset | None,
+    settings: FitSettings,
+    *,
+    summed: xr.Dataset | None = None,
+    refine_columns: int | None = 10,
+) -> Job:
+    """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
+    schema.validate(columns, schema.COLUMNS, "columns")
+    shift = np.zeros((movie.n_frames, 2))
+    if drift is not None:
+        schema.validate(drift, schema.DRIFT, "drift")
+        shift = drift["drift"].to_numpy().astype(np.float64)
+        if shift.shape != (movie.n_frames, 2):
+            raise SettingsError(
+                "the drift is of another movie",
+                "drift",
+                f"{movie.n_frames} frames",
+                f"{shift.shape[0]}",
+                "Measure it on this one",
+            )
+    window = settings.window_px or int(columns.attrs.get("window_px") or default_window(columns))
+    if window % 2 == 0 or window > min(movie.shape[1:]):
+        raise SettingsError(
+            "the window cannot be used",
+            "setting window_px (FitSettings)",
+            f"an odd number up to {min(movie.shape[1:])}",
+            str(window),
+        )
+    box = settings.vacuum_box
+    if box is not None:
+        check_box(box, movie.shape[1:], shift)
+    elif summed is not None:
+        box = find_vacuum(summed, columns, settings.blur_sigma_px)
+    bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
+    return Job(_reference(columns), shift, bad, window, box, refine_columns if drift is not None else None, settings)
+
+
+def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
+    """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
+    numbers = np.concatenate([job.reference.ravel(), job.drift.ravel(), columns["column_id"].to_numpy().astype(float)])
+    kinds = "\0".join(map(str, columns["kind"].to_numpy()))
+    rest = f"{movie.gain!r} {job.window} {job.vacuum} {job.refine_columns} {kinds}"
+    return stage_key(movie.key, numbers.tobytes(), rest, job.settings)
+
+
+def default_window(columns: xr.Dataset) -> int:
+    """Return the side of a window from the columns' spacing: half the median distance to the nearest neighbour, odd.
+
+    On CeO2 in [110] it reaches the flanks of the oxygen columns, which lie at 0.42 of that distance.
+    """
+    place = np.stack([columns["y_ref"].to_numpy(), columns["x_ref"].to_numpy()], axis=1)
+    if len(place) < 2:
+        raise SettingsError(
+            "one column alone does not tell how large its window should be",
+            "setting window_px (FitSettings)",
+            "two columns or more, or a window",
+            "one column",
+            "Give --window-px",
+        )
+    nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
+    return max(7, 2 * round(0.25 * float(np.median(nearest))) + 1)
+
+
+def frame_times(movie: Movie) -> Floats:
+    """Return the start of each frame in s; the frame's number where the frame time is not known."""
+    return np.arange(movie.n_frames, dtype=np.float64) * (movie.frame_time_s or 1.0)
+
+
+def _fit_task(movie_path: Path, path: Path, key: str, shard: Shard) -> Payload:
+    movie, job = _load(movie_path, path, key)
+    values = measure(movie, shard, job)
+    results.write(path, shard, values)
+    fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
+    return {
+        "fits": int(fitted.sum()),
+        "accepted": int(((values["status"] & REJECTED) == 0).sum()),
+        "bad_frames": int(job.bad[shard.start : shard.stop].sum()),
+    }
+
+
+@lru_cache(maxsize=4)
+def _load(movie_path: Path, path: Path, key: str) -> tuple[Movie, Job]:
+    """Return what the tasks of one fit stage share, from the stores; ``key`` tells one stage from the next."""
+    movie = open_movie(movie_path)
+    store = stores.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
+    about = stores.attributes(path)
+    bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
+    vacuum = tuple(about["vacuum"]) if about["vacuum"] else None
+    settings = from_toml(FitSettings, about["settings"], str(path))
+    drift = store["drift_measured"].to_numpy()
+    return movie, Job(_reference(store), drift, bad, about["window"], vacuum, about["refine_columns"], settings)
+
+
+def _reference(columns: xr.Dataset) -> Floats:
+    """Return the fit on the summed image; columns that have none get the median shape at their seed's place."""
+    reference: Floats = columns["fit_ref"].to_numpy().astype(np.float64)
+    known = np.isfinite(reference).all(axis=1)
+    if not known.any():
+        raise SettingsError(
+            "no column could be fitted in the summed image",
+            "columns",
+            "at least one",
+            "0",
+            "Check the contrast and the seeds",
+        )
+    reference[~known] = np.median(reference[known], axis=0)
+    reference[:, X] = np.where(known, reference[:, X], columns["x_ref"].to_numpy())
+    reference[:, Y] = np.where(known, reference[:, Y], columns["y_ref"].to_numpy())
+    return reference
+
+
+def _calibration(movie: Movie) -> dict[str, float | None]:
+    return {"pixel_size_pm": movie.pixel_size_pm, "frame_time_s": movie.frame_time_s, "dose": movie.dose}
