@@ -1,0 +1,5 @@
+"""Movies with known truth."""
+
+from .movie import simulate_movie
+
+__all__ = ["simulate_movie"]
