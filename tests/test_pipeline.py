@@ -1,0 +1,320 @@
+"""The whole run on a small scene: what it writes, what it keeps, and what it does again."""
+
+import csv
+import dataclasses
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from conftest import Scene
+from distributed import Client, LocalCluster
+
+from tract_dask import cluster, pipeline, settings, stores
+from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError
+from tract_dask.progress import RunDone, RunStarted, StageDone, StageStarted, Warned
+from tract_dask.results import open_results
+from tract_dask.settings import ConvertSettings, RunSettings
+from tract_dask.stages import STAGES
+
+SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1))
+
+
+@pytest.fixture(scope="module")
+def client():
+    with (
+        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+        yield client
+
+
+class Job:
+    """A run of one movie, again and again, with changed settings."""
+
+    def __init__(self, source: Path, output: Path, client: Client) -> None:
+        self.source, self.output, self.client = source, output, client
+        self.events = []
+
+    def __call__(self, changed: RunSettings = SETTINGS, **more) -> pipeline.RunOutcome:
+        self.events.clear()
+        more = {"client": self.client} | more
+        return pipeline.run(self.source, self.output, changed, on_event=self.events.append, **more)
+
+    def of(self, kind: type) -> list:
+        return [event for event in self.events if isinstance(event, kind)]
+
+    @property
+    def worked(self) -> set[str]:
+        return {event.stage for event in self.of(StageDone) if not event.reused}
+
+
+def change(**groups: dict) -> RunSettings:
+    return dataclasses.replace(
+        SETTINGS, **{name: dataclasses.replace(getattr(SETTINGS, name), **values) for name, values in groups.items()}
+    )
+
+
+@pytest.fixture(scope="module")
+def base(client, tmp_path_factory) -> Job:
+    """A finished run, to be copied."""
+    folder = tmp_path_factory.mktemp("base")
+    np.save(folder / "movie.npy", Scene().counts())
+    job = Job(folder / "movie.npy", folder / "out", client)
+    job()
+    return job
+
+
+@pytest.fixture
+def done(base, tmp_path) -> Job:
+    """The same movie with a finished run of its own."""
+    shutil.copytree(base.output, tmp_path / "out")
+    return Job(base.source, tmp_path / "out", base.client)
+
+
+@pytest.fixture
+def job(scene, npy, tmp_path, client) -> Job:
+    return Job(npy(scene.counts()), tmp_path / "out", client)
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_run_writes_everything_and_finds_the_scene(job, scene):
+    outcome = job()
+    assert outcome.state == "done"
+    assert outcome.columns == len(scene.place)
+    assert outcome.frames == scene.n_frames
+    assert outcome.fits == scene.n_frames * len(scene.place)
+    assert set(outcome.seconds) == set(STAGES)
+    assert all(Path(path).exists() for path in outcome.outputs.paths().values())
+    results = open_results(outcome.outputs.results).load()
+    place = np.stack([results["x_ref"], results["y_ref"]], axis=1)
+    nearest = np.linalg.norm(place[:, None] - scene.place[None], axis=-1).min(axis=1)
+    assert nearest.max() < 1.0  # px; noise and the drift's own zero
+    assert job.of(RunStarted)[0].source == str(job.source)
+    assert job.of(RunDone)[-1].state == "done"
+
+
+def test_second_run_does_nothing_and_starts_no_cluster(done, scene, monkeypatch):
+    monkeypatch.setattr(cluster, "connect", lambda *_: pytest.fail("a cluster was started"))
+    again = done(client=None)
+    assert again.reused == STAGES
+    assert again.seconds == {}
+    assert (again.fits, again.columns) == (scene.n_frames * len(scene.place), len(scene.place))
+    assert "nothing to do" in done.of(RunDone)[0].message
+
+
+@pytest.mark.parametrize(
+    ("changed", "worked"),
+    [
+        ({"fit": {"threshold": 3.0}}, {"fit"}),
+        ({"fit": {"window_px": 21}}, {"columns", "fit"}),
+        ({"drift": {"refine": False}}, {"fit"}),
+        ({"columns": {"min_amplitude": 0.2}}, {"columns"}),
+        ({"columns": {"search_radius_px": 0.0}}, {"columns"}),
+        ({"drift": {"method": "none"}}, {"drift", "sum", "columns", "fit"}),
+        ({"metadata": {"gain": 2.0}}, {"sum", "columns", "fit"}),
+        ({"convert": {"codec": "zstd"}}, {"convert", "drift", "sum", "fit"}),
+        ({"cluster": {"workers": 1}}, set()),
+    ],
+)
+def test_changed_setting_redoes_only_what_it_affects(done, changed, worked):
+    done(change(**changed))
+    assert done.worked == worked
+
+
+def test_changed_pixel_size_and_time_are_only_written_down(done):
+    outcome = done(change(metadata={"pixel_size_pm": 7.8, "frame_time_s": 0.5}))
+    assert done.worked <= {"columns"}  # its figure has a scale bar
+    for path in (outcome.outputs.drift, outcome.outputs.sum, outcome.outputs.columns.with_suffix(".zarr")):
+        assert stores.open_dataset(path).attrs["pixel_size_pm"] == 7.8
+    assert open_results(outcome.outputs.results).attrs["pixel_size_pm"] == 7.8
+    assert tomllib.loads(outcome.outputs.settings.read_text())["metadata"]["frame_time_s"] == 0.5
+
+
+def test_edited_columns_are_kept_and_fitted_anew(done, scene):
+    file = done.output / "columns.csv"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([lines[0], *lines[2:]]) + "\n")
+    edited = file.read_text()
+    second = done()
+    assert done.worked == {"columns", "fit"}
+    assert any("edited by hand" in event.message for event in done.of(Warned))
+    assert second.columns == len(scene.place) - 1
+    assert file.read_text() == edited
+    assert done().reused == STAGES
+    assert done.of(Warned) == []
+
+
+def test_edited_columns_are_put_away_where_new_settings_replace_them(done):
+    file = done.output / "columns.csv"
+    lines = file.read_text().splitlines()
+    edited = "\n".join([lines[0], *lines[2:]]) + "\n"
+    file.write_text(edited)
+    done()
+    done(change(columns={"min_amplitude": 0.2}))
+    assert len(table(file)) == len(lines) - 1
+    assert file.with_stem("columns-edited").read_text() == edited
+
+
+def test_interrupted_and_failed_runs_go_on_to_the_same_result(base, done, monkeypatch):
+    expected = open_results(base.output / "results.zarr").load()
+    stores.remove(done.output / "results.zarr")
+    from tract_dask import fit
+
+    measure, calls = fit.measure, []
+
+    def fail_at_the_third(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return measure(*arguments)
+
+    monkeypatch.setattr(fit, "measure", fail_at_the_third)
+    from tract_dask import stages
+
+    fit_here = stages.fit.fit_movie
+    monkeypatch.setattr(stages.fit, "fit_movie", lambda *args, **more: fit_here(*args, **(more | {"client": None})))
+    with pytest.raises(KeyboardInterrupt):
+        done()
+    assert done.of(RunDone)[-1].state == "interrupted"
+    monkeypatch.setattr(fit, "measure", measure)
+    done()
+    (started,) = [event for event in done.of(StageStarted) if event.stage == "fit"]
+    assert started.done_frames == 4
+    found = open_results(done.output / "results.zarr").load()
+    xr.testing.assert_equal(found, expected)
+
+
+def test_plan_says_what_will_be_done_and_writes_nothing(job):
+    outcome = job(plan_only=True)
+    assert outcome.state == "planned"
+    assert not job.output.exists()
+    plan = outcome.plan
+    raw = 12 * 160 * 144 * 2
+    assert (plan.frames, plan.shards, plan.frames_per_shard) == (12, 6, 2)
+    assert raw < plan.bytes_written < 1.2 * raw
+    assert plan.bytes_read > 3 * raw
+    assert pipeline.WORKER_BYTES < plan.peak_memory < plan.memory_limit
+
+
+def test_work_over_budget_is_refused_with_both_numbers(job):
+    plan = pipeline.plan_run((600, 4096, 4096), np.dtype("uint16"), RunSettings(), 500_000_000)
+    with pytest.raises(ClusterError, match=r"at most 0\.50 GB") as caught:
+        plan.check()
+    assert f"{plan.peak_memory / 1e9:.2f} GB" in caught.value.got
+    assert "--shard-mb" in caught.value.remedy
+
+
+def test_memory_is_checked_before_work(job, monkeypatch):
+    monkeypatch.setattr(pipeline, "memory_budget", lambda client: 1_000)
+    with pytest.raises(ClusterError, match="does not fit"):
+        job()
+    assert not (job.output / "movie.zarr").exists()
+    assert job.of(RunDone)[-1].state == "failed"
+
+
+def test_folder_that_holds_something_else_is_left_alone(job):
+    job.output.mkdir()
+    (job.output / "thesis.txt").write_text("years of work")
+    with pytest.raises(DestinationError, match="holds something else") as caught:
+        job()
+    assert "thesis.txt" in caught.value.got
+    job(overwrite=True)
+    assert (job.output / "thesis.txt").read_text() == "years of work"
+
+
+def test_file_in_the_place_of_the_folder(job):
+    job.output.write_text("")
+    with pytest.raises(DestinationError, match="holds something else"):
+        job(overwrite=True)
+
+
+def test_run_of_another_movie_is_not_replaced(done, npy, scene):
+    other = npy(scene.counts()[:8], "other.npy")
+    with pytest.raises(DestinationError, match="another movie"):
+        pipeline.run(other, done.output, SETTINGS, client=done.client)
+    outcome = pipeline.run(other, done.output, SETTINGS, client=done.client, overwrite=True)
+    assert outcome.frames == 8
+
+
+def test_two_runs_in_one_folder(job):
+    job.output.mkdir()
+    with pipeline._sole_run(pipeline.Outputs(job.output)), pytest.raises(DestinationError, match="another run works"):
+        job()
+
+
+def test_frames_with_nan_end_as_bad_frames(npy, scene, tmp_path, client):
+    frames = scene.counts().astype(np.float32)
+    frames[5, 80, 70] = np.nan
+    outcome = Job(npy(frames), tmp_path / "out", client)()
+    assert (outcome.state, outcome.bad_frames) == ("done_with_bad_frames", 1)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"columns": {"method": "csv"}}, "needs a file"),
+        ({"columns": {"method": "csv", "csv": "nowhere.csv"}}, "nowhere.csv"),
+        ({"drift": {"method": "csv", "csv": "nowhere.csv"}}, "nowhere.csv"),
+        ({"cluster": {"memory_limit": "much"}}, "no size"),
+    ],
+)
+def test_faults_in_small_inputs_are_found_before_anything_is_written(job, changed, message):
+    with pytest.raises(InputError, match=message):
+        job(change(**changed))
+    assert not job.output.exists()
+
+
+def test_run_toml_gives_the_same_settings_and_says_what_was_unset(job):
+    outcome = job(change(metadata={"pixel_size_pm": 8.0}))
+    text = outcome.outputs.settings.read_text()
+    assert settings.load(outcome.outputs.settings) == change(metadata={"pixel_size_pm": 8.0})
+    assert "# fit.window_px = " in text
+    assert "# cluster.scheduler  (" in text
+
+
+def test_single_stages_end_as_the_run_does(base, tmp_path):
+    expected = open_results(base.output / "results.zarr").load()
+    movie, drift, columns, results = (tmp_path / name for name in ("m.zarr", "d.zarr", "c.csv", "r.zarr"))
+    pipeline.run_convert(base.source, movie, SETTINGS, client=base.client)
+    pipeline.run_drift(movie, drift, SETTINGS, client=base.client)
+    found = pipeline.run_columns(movie, columns, SETTINGS, drift, client=base.client)
+    assert found.sizes["column_id"] == expected.sizes["column_id"]
+    summary = pipeline.run_fit(movie, columns, results, SETTINGS, drift, client=base.client)
+    assert summary.fits == expected.sizes["frame"] * expected.sizes["column_id"]
+    again = open_results(results).load()
+    np.testing.assert_allclose(again["fit"], expected["fit"], atol=1e-3)
+    assert columns.with_suffix(".png").exists()
+
+
+def test_single_stage_does_not_replace_a_store_of_another_kind(job, tmp_path):
+    movie = tmp_path / "m.zarr"
+    pipeline.run_convert(job.source, movie, SETTINGS, client=job.client)
+    with pytest.raises(DestinationError, match="another kind"):
+        pipeline.run_drift(movie, movie, SETTINGS, client=job.client)
+
+
+def test_columns_need_a_table_and_do_not_replace_a_foreign_one(job, tmp_path):
+    movie, mine = tmp_path / "m.zarr", tmp_path / "mine.csv"
+    pipeline.run_convert(job.source, movie, SETTINGS, client=job.client)
+    with pytest.raises(DestinationError, match=r"ends in \.csv"):
+        pipeline.run_columns(movie, tmp_path / "c.zarr", SETTINGS, client=job.client)
+    mine.write_text("x,y\n1,2\n")
+    with pytest.raises(DestinationError, match="not written by tract-dask"):
+        pipeline.run_columns(movie, mine, SETTINGS, client=job.client)
+    assert mine.read_text() == "x,y\n1,2\n"
+
+
+def test_seeds_outside_the_image_keep_what_is_done(job, tmp_path):
+    seeds = tmp_path / "seeds.csv"
+    seeds.write_text("x,y\n1000,20\n")
+    with pytest.raises(SettingsError):
+        job(change(columns={"method": "csv", "csv": str(seeds)}))
+    job()
+    assert "convert" not in job.worked

@@ -1,0 +1,90 @@
+"""Runs that lose processes: killed whole, killed in part, and spread over processes that were started by hand."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+from tract_dask import pipeline
+from tract_dask.cluster import connect
+from tract_dask.progress import ShardDone
+from tract_dask.results import open_results
+from tract_dask.settings import ClusterSettings, ConvertSettings, RunSettings
+
+ROOT = Path(__file__).parent.parent
+SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1), cluster=ClusterSettings(workers=2))
+
+
+@pytest.fixture
+def movie(scene, npy) -> Path:
+    scene.n_frames = 48
+    scene.__post_init__()
+    return npy(scene.counts())
+
+
+def test_killed_runs_end_as_an_uninterrupted_one(movie, tmp_path):
+    options = [
+        "--moments",
+        "1",
+        "--stage",
+        "fit",
+        "--movie",
+        movie,
+        "--shard-mb",
+        "1",
+        "--workers",
+        "1",
+        "--folder",
+        tmp_path,
+    ]
+    found = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "kill_test", *options], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
+    assert "1 of 1 identical" in found.stdout
+
+
+def test_killed_worker_is_replaced_and_nothing_is_lost(movie, tmp_path):
+    killed = []
+
+    def kill_once_in_a_stage(event):
+        if isinstance(event, ShardDone) and event.stage in {"convert", "fit"} - set(killed):
+            killed.append(event.stage)
+            pid = min(client.run(os.getpid).values())
+            os.kill(pid, signal.SIGKILL)
+
+    with connect(SETTINGS.cluster) as client:
+        whole = pipeline.run(movie, tmp_path / "whole", SETTINGS, client=client)
+        hurt = pipeline.run(movie, tmp_path / "hurt", SETTINGS, client=client, on_event=kill_once_in_a_stage)
+    assert killed == ["convert", "fit"]
+    assert hurt.fits == whole.fits
+    xr.testing.assert_equal(open_results(whole.outputs.results).load(), open_results(hurt.outputs.results).load())
+
+
+def test_scheduler_and_workers_started_by_hand_give_the_same_results(movie, tmp_path):
+    file = tmp_path / "scheduler.json"
+    options = ["--scheduler-file", str(file), "--no-dashboard"]
+    commands = [["scheduler", "--port", "0", *options]] + 2 * [
+        ["worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path), *options]
+    ]
+    processes = []
+    try:
+        for command in commands:
+            processes.append(
+                subprocess.Popen([sys.executable, "-m", "dask", *command], cwd=tmp_path, stderr=subprocess.DEVNULL)
+            )
+            while not file.exists() or not file.read_text():
+                assert processes[0].poll() is None
+        far = ClusterSettings(scheduler_file=str(file))
+        spread = pipeline.run(movie, tmp_path / "far", RunSettings(convert=SETTINGS.convert, cluster=far))
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    with connect(ClusterSettings(workers=1)) as client:
+        local = pipeline.run(movie, tmp_path / "near", SETTINGS, client=client)
+    xr.testing.assert_equal(open_results(spread.outputs.results).load(), open_results(local.outputs.results).load())

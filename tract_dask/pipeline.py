@@ -1,0 +1,528 @@
+"""The stages strung together: a run from a movie on disk to tracks, its plan, and every stage as a job of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from distributed import Client
+
+from . import stores
+from .cluster import LazyClient, local_memory_limit, memory_budget
+from .drift import read_drift_csv
+from .errors import ClusterError, DestinationError, InputError
+from .fit import FitSummary
+from .io import FrameSource, open_source
+from .layout import peak_memory, plan_layout
+from .movie import Movie, open_movie
+from .progress import Event, JsonLines, RunDone, RunStarted, Sink, StageDone, silent, tee
+from .seeds import read_columns_csv
+from .settings import ClusterSettings, RunSettings, to_toml
+from .shards import journal_beside, split
+from .stages import columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
+
+WORKER_BYTES = 300_000_000
+"""What a worker process takes before it has read a pixel."""
+
+BATCH_BYTES = 128_000_000
+"""What a task that reads the movie works on at a time, beside the frames themselves and the sums of the field."""
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The places of everything that a run writes, under one folder."""
+
+    root: Path
+
+    @property
+    def movie(self) -> Path:
+        """The converted movie."""
+        return self.root / "movie.zarr"
+
+    @property
+    def drift(self) -> Path:
+        """The drift of every frame."""
+        return self.root / "drift.zarr"
+
+    @property
+    def sum(self) -> Path:
+        """The drift-corrected sum."""
+        return self.root / "sum.zarr"
+
+    @property
+    def columns(self) -> Path:
+        """The columns as a table that can be edited; beside it ``columns.zarr`` and ``columns.png``."""
+        return self.root / "columns.csv"
+
+    @property
+    def results(self) -> Path:
+        """The tracks."""
+        return self.root / "results.zarr"
+
+    @property
+    def settings(self) -> Path:
+        """Every setting of the run."""
+        return self.root / "run.toml"
+
+    @property
+    def events(self) -> Path:
+        """What happened when."""
+        return self.root / "events.jsonl"
+
+    def paths(self) -> dict[str, str]:
+        """Return the paths by name."""
+        names = ("movie", "drift", "sum", "columns", "results", "settings", "events")
+        return {name: str(getattr(self, name)) for name in names} | {"figure": str(self.columns.with_suffix(".png"))}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run is going to do, known before it does anything.
+
+    Attributes
+    ----------
+    frames, shards, frames_per_shard
+        The units of work.
+    bytes_read, bytes_written
+        From and to disk, before compression: the source once, the movie twice; the movie with its binned levels.
+    peak_memory
+        Bytes that a task needs with its worker, at most.
+    memory_limit
+        Bytes that it may use; None where the workers have no limit.
+    """
+
+    frames: int
+    shards: int
+    frames_per_shard: int
+    bytes_read: int
+    bytes_written: int
+    peak_memory: int
+    memory_limit: int | None = None
+
+    def check(self) -> None:
+        """Refuse work that does not fit.
+
+        Raises
+        ------
+        ClusterError
+            With both numbers.
+        """
+        if self.memory_limit is not None and self.peak_memory > self.memory_limit:
+            raise ClusterError(
+                "the work does not fit into a worker's memory",
+                "plan",
+                f"at most {self.memory_limit / 1e9:.2f} GB a task",
+                f"{self.peak_memory / 1e9:.2f} GB for shards of {self.frames_per_shard} frames",
+                "Make shards smaller (--shard-mb), give workers more memory (--memory-limit), or start fewer",
+            )
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a run did.
+
+    Attributes
+    ----------
+    state
+        ``planned``, ``done`` or ``done_with_bad_frames``.
+    seconds
+        Time of every stage that worked, in s.
+    reused
+        Stages that an earlier run had finished.
+    """
+
+    outputs: Outputs
+    plan: Plan
+    state: str
+    frames: int
+    columns: int = 0
+    fits: int = 0
+    accepted: int = 0
+    bad_frames: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    reused: tuple[str, ...] = ()
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the outcome as a JSON-ready mapping."""
+        return dataclasses.asdict(self) | {"outputs": self.outputs.paths(), "reused": list(self.reused)}
+
+
+def plan_run(
+    shape: tuple[int, int, int], dtype: np.dtype[Any], settings: RunSettings, memory_limit: int | None = None
+) -> Plan:
+    """Return the plan for a movie of ``shape`` (frames, y, x) and ``dtype``; a pure function."""
+    layout = plan_layout(shape, dtype, settings.convert)
+    raw = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    shard = raw // shape[0] * layout.frames_per_shard
+    binned = sum(4 * shape[0] * (shape[1] // bin_) * (shape[2] // bin_) for bin_ in layout.bins)
+    return Plan(
+        frames=shape[0],
+        shards=len(split(shape[0], layout.frames_per_shard)),
+        frames_per_shard=layout.frames_per_shard,
+        bytes_read=3 * raw + binned,
+        bytes_written=raw + binned,
+        peak_memory=WORKER_BYTES + max(peak_memory(layout), BATCH_BYTES + max(2 * shard, 24 * shape[1] * shape[2])),
+        memory_limit=memory_limit,
+    )
+
+
+def run(
+    source: str | Path,
+    output: str | Path,
+    settings: RunSettings | None = None,
+    *,
+    client: Client | None = None,
+    on_event: Sink = silent,
+    overwrite: bool = False,
+    plan_only: bool = False,
+) -> RunOutcome:
+    """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
+
+    What an earlier run with the same settings has done is kept; changed settings redo what they affect. A table of
+    columns that was edited by hand is kept, and fitted.
+
+    Parameters
+    ----------
+    source
+        Any movie that :func:`tract_dask.open_source` reads.
+    output
+        A folder; see :class:`Outputs`.
+    client
+        The cluster to run on; None: the one that ``settings.cluster`` names, if there is anything to do.
+    on_event
+        Takes the run's progress.
+    overwrite
+        Begin anew, even where the folder holds something else.
+    plan_only
+        Only plan, and write nothing.
+
+    Raises
+    ------
+    InputError
+        Where the source, the settings or the folder cannot be used; nothing is written then.
+    ClusterError
+        Where the cluster cannot do the work.
+    TractError
+        Where a stage fails; what is done is kept, and the same call goes on from there.
+    """
+    settings = _absolute(settings or RunSettings())
+    outputs = Outputs(Path(output).absolute())
+    with closing(_open(source, settings)) as opened:
+        _check_inputs(opened, settings)
+        if plan_only:
+            plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
+            return RunOutcome(outputs, plan, "planned", plan.frames)
+        _check_output(outputs, opened, overwrite=overwrite)
+        with _sole_run(outputs):
+            if overwrite:
+                _clear(outputs)
+            return _run(opened, outputs, settings, client, on_event)
+
+
+def run_convert(
+    source: str | Path,
+    destination: str | Path,
+    settings: RunSettings | None = None,
+    *,
+    client: Client | None = None,
+    on_event: Sink = silent,
+    overwrite: bool = False,
+) -> Movie:
+    """Convert a movie to the store ``destination``; the first stage of :func:`run`, alone."""
+    settings, path = _absolute(settings or RunSettings()), Path(destination).absolute()
+    with closing(_open(source, settings)) as opened:
+        plan = plan_run(opened.shape, opened.dtype, settings)
+        with _Session(opened.path, path, settings.cluster, client, on_event, plan) as session:
+            return convert_stage(opened, path, settings, session.workers, session.send, overwrite=overwrite)
+
+
+def run_drift(
+    movie: str | Path,
+    output: str | Path,
+    settings: RunSettings | None = None,
+    *,
+    client: Client | None = None,
+    on_event: Sink = silent,
+) -> xr.Dataset:
+    """Measure the drift of a movie store into the store ``output``."""
+    settings, path, opened = _absolute(settings or RunSettings()), Path(output).absolute(), open_movie(movie)
+    with _Session(str(movie), path, settings.cluster, client, on_event) as session:
+        return drift_stage(opened, path, settings.drift, session.workers, session.send)
+
+
+def run_columns(
+    movie: str | Path,
+    output: str | Path,
+    settings: RunSettings | None = None,
+    drift: str | Path | None = None,
+    *,
+    client: Client | None = None,
+    on_event: Sink = silent,
+    overwrite: bool = False,
+) -> xr.Dataset:
+    """Find the columns of a movie store into the table ``output`` (.csv); the summed image is kept beside it."""
+    settings, path, opened = _absolute(settings or RunSettings()), Path(output).absolute(), open_movie(movie)
+    _check_suffix(path, ".csv")
+    shift = None if drift is None else stores.open_dataset(Path(drift))
+    with _Session(str(movie), path, settings.cluster, client, on_event) as session:
+        summed = sum_stage(opened, shift, _sum_of(path), session.workers, session.send)
+        return columns_stage(summed, path, settings.columns, settings.fit, session.send, overwrite=overwrite)
+
+
+def run_fit(
+    movie: str | Path,
+    columns: str | Path,
+    results: str | Path,
+    settings: RunSettings | None = None,
+    drift: str | Path | None = None,
+    *,
+    client: Client | None = None,
+    on_event: Sink = silent,
+) -> FitSummary:
+    """Fit the columns of a table (.csv) in every frame of a movie store, into the store ``results``."""
+    settings, path, opened = _absolute(settings or RunSettings()), Path(results).absolute(), open_movie(movie)
+    table = Path(columns).absolute()
+    stores.check_destination(path)
+    shift = None if drift is None else stores.open_dataset(Path(drift))
+    chosen = dataclasses.replace(settings.columns, method="csv", csv=str(table))
+    read_columns_csv(table)
+    with _Session(str(movie), path, settings.cluster, client, on_event) as session:
+        summed = sum_stage(opened, shift, _sum_of(path), session.workers, session.send)
+        found = columns_stage(summed, path.with_name(f"{path.stem}_columns.csv"), chosen, settings.fit, session.send)
+        refine = _refine_columns(settings)
+        return fit_stage(opened, found, shift, summed, path, settings.fit, refine, session.workers, session.send)
+
+
+def _run(
+    source: FrameSource, outputs: Outputs, settings: RunSettings, client: Client | None, on_event: Sink
+) -> RunOutcome:
+    """Run the stages in their order."""
+    record = _Record()
+    send = tee((record, JsonLines(outputs.events), on_event))
+    plan = plan_run(source.shape, source.dtype, settings)
+    with _Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
+        stores.write_aside(outputs.settings, _run_toml(settings, {}).encode())
+        movie = convert_stage(source, outputs.movie, settings, session.workers, send, overwrite=True)
+        drift = drift_stage(movie, outputs.drift, settings.drift, session.workers, send)
+        summed = sum_stage(movie, drift, outputs.sum, session.workers, send)
+        columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send)
+        refine = _refine_columns(settings)
+        summary = fit_stage(movie, columns, drift, summed, outputs.results, settings.fit, refine, session.workers, send)
+        stores.write_aside(outputs.settings, _run_toml(settings, _resolved(movie, columns, outputs)).encode())
+        session.state = "done_with_bad_frames" if summary.bad_frames else "done"
+        session.message = "" if record.seconds else "all was done before: nothing to do"
+    return RunOutcome(
+        outputs,
+        plan,
+        session.state,
+        plan.frames,
+        columns.sizes["column_id"],
+        summary.fits,
+        summary.accepted,
+        summary.bad_frames,
+        record.seconds,
+        record.reused,
+    )
+
+
+class _Session:
+    """What every job has around it: a client at its first use, and events that tell its beginning and its end."""
+
+    def __init__(
+        self,
+        source: str,
+        output: Path,
+        cluster: ClusterSettings,
+        client: Client | None,
+        send: Sink,
+        plan: Plan | None = None,
+    ) -> None:
+        self._started, self._plan, self._began = RunStarted(source, str(output)), plan, perf_counter()
+        self.workers, self.send = LazyClient(cluster, client, self._on_connect), send
+        self.state, self.message = "done", ""
+
+    def __enter__(self) -> _Session:
+        self.send(self._started)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.workers.close()
+        if kind is not None:
+            self.state, self.message = "interrupted" if kind is KeyboardInterrupt else "failed", ""
+        self.send(RunDone(self.state, perf_counter() - self._began, self.message))
+
+    def _on_connect(self, client: Client) -> None:
+        if self._plan:
+            dataclasses.replace(self._plan, memory_limit=memory_budget(client)).check()
+        self.send(dataclasses.replace(self._started, dashboard=client.dashboard_link or ""))
+
+
+class _Record:
+    """A sink that keeps how long every stage took, and which were done before."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.reused: tuple[str, ...] = ()
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, StageDone):
+            if event.reused:
+                self.reused += (event.stage,)
+            else:
+                self.seconds[event.stage] = event.seconds
+
+
+def _open(source: str | Path, settings: RunSettings) -> FrameSource:
+    """Open the source by its whole path, which any worker can use."""
+    return open_source(str(Path(source).absolute()), settings.source, settings.metadata)
+
+
+def _sum_of(path: Path) -> Path:
+    return path.with_name(f"{path.stem}_sum.zarr")
+
+
+def _refine_columns(settings: RunSettings) -> int | None:
+    return settings.drift.refine_columns if settings.drift.refine and settings.drift.method != "none" else None
+
+
+def _check_suffix(path: Path, suffix: str) -> None:
+    if path.suffix != suffix:
+        raise DestinationError(
+            "the name does not fit", str(path), f"a name that ends in {suffix}", path.name, "Change it"
+        )
+
+
+def _absolute(settings: RunSettings) -> RunSettings:
+    """Return the settings with whole paths, so that they mean the same from any folder."""
+
+    def whole(path: str | None) -> str | None:
+        return None if path is None else str(Path(path).absolute())
+
+    return dataclasses.replace(
+        settings,
+        drift=dataclasses.replace(settings.drift, csv=whole(settings.drift.csv)),
+        columns=dataclasses.replace(settings.columns, csv=whole(settings.columns.csv)),
+        cluster=dataclasses.replace(settings.cluster, scheduler_file=whole(settings.cluster.scheduler_file)),
+    )
+
+
+def _check_inputs(source: FrameSource, settings: RunSettings) -> None:
+    """Read the small inputs once, so that a fault in them is found before any work."""
+    if settings.drift.method == "csv":
+        read_drift_csv(_required(settings.drift.csv, "--drift-csv"), source.shape[0])
+    if settings.columns.method == "csv":
+        read_columns_csv(_required(settings.columns.csv, "--columns"))
+    local_memory_limit(settings.cluster)
+
+
+def _required(path: str | None, option: str) -> Path:
+    if path is None:
+        raise InputError("method csv needs a file", "settings", option, "none", f"Give one with {option}")
+    return Path(path)
+
+
+def _check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> None:
+    """Check that the folder is empty or holds a run of this movie, and can be written."""
+    root = outputs.root
+    ours = outputs.settings.exists() or outputs.events.exists()
+    if root.exists() and not root.is_dir():
+        raise DestinationError(
+            "this place holds something else", str(root), "a folder", "a file", "Choose another place"
+        )
+    others = sorted(path.name for path in root.glob("[!.]*"))
+    if others and not ours and not overwrite:
+        raise DestinationError(
+            "this folder holds something else",
+            str(root),
+            "an empty folder, or that of an earlier run",
+            ", ".join(others[:3]),
+            "Choose another place, or say --overwrite",
+        )
+    before = stores.attributes(outputs.movie).get("source", source.path)
+    if Path(before).absolute() != Path(source.path).absolute() and not overwrite:
+        raise DestinationError(
+            "this folder holds the run of another movie",
+            str(root),
+            source.path,
+            str(before),
+            "Choose another place, or say --overwrite",
+        )
+    root.mkdir(parents=True, exist_ok=True)
+    stores.check_destination(outputs.movie, overwrite=overwrite)
+
+
+def _clear(outputs: Outputs) -> None:
+    """Delete what a run writes, and nothing else."""
+    stages = (outputs.movie, outputs.drift, outputs.sum, outputs.columns.with_suffix(".zarr"), outputs.results)
+    for path in stages:
+        stores.remove(path)
+        stores.remove(journal_beside(path))
+    for path in (outputs.columns, outputs.columns.with_suffix(".png"), outputs.settings, outputs.events):
+        stores.remove(path)
+
+
+@contextmanager
+def _sole_run(outputs: Outputs) -> Iterator[None]:
+    """Hold the folder against a second run; the lock ends with the process, however that ends."""
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    with (outputs.root / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DestinationError(
+                "another run works in this folder",
+                str(outputs.root),
+                remedy="Wait for it, stop it, or choose another place",
+            ) from error
+        yield
+
+
+def _expected_limit(settings: RunSettings, client: Client | None) -> int | None:
+    """Return the bytes that a task may use, without starting workers."""
+    cluster = settings.cluster
+    if client is None and not (cluster.scheduler or cluster.scheduler_file):
+        return local_memory_limit(cluster)
+    with closing(LazyClient(cluster, client)) as workers:
+        return memory_budget(workers())
+
+
+def _resolved(movie: Movie, columns: xr.Dataset, outputs: Outputs) -> dict[str, Any]:
+    """Return what the data gave for settings that were unset."""
+    about = stores.attributes(outputs.results)
+    found = {
+        "metadata.pixel_size_pm": movie.pixel_size_pm,
+        "metadata.frame_time_s": movie.frame_time_s,
+        "metadata.dose": movie.dose,
+        "columns.spacing_px": columns.attrs.get("spacing_px"),
+        "fit.window_px": about.get("window"),
+        "fit.vacuum_box": about.get("vacuum"),
+    }
+    return {name: stores.json_ready(value) for name, value in found.items() if value is not None}
+
+
+def _run_toml(settings: RunSettings, resolved: dict[str, Any]) -> str:
+    """Return all settings as TOML; what is unset stands in comments, with the value that the data gave."""
+    lines = [to_toml(settings), "# Unset:"]
+    for group in dataclasses.fields(settings):
+        values = getattr(settings, group.name)
+        for item in dataclasses.fields(values):
+            if getattr(values, item.name) is None:
+                name = f"{group.name}.{item.name}"
+                value = f" = {resolved[name]}" if name in resolved else ""
+                lines.append(f"# {name}{value}  ({item.metadata['description']})")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,218 @@
+"""A run's progress on the terminal: a line a stage, redrawn in place; plain lines where the output is no terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import monotonic
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from .progress import Event, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
+
+_PLAIN_INTERVAL_S = 10.0
+_ENDS = {
+    "done": "done",
+    "done_with_bad_frames": "done, with frames that could not be fitted",
+}
+
+
+@dataclass
+class Line:
+    """What the terminal knows of one stage."""
+
+    stage: str
+    frames: int = 0
+    done_before: int = 0
+    frame_bytes: int = 0
+    columns: int = 0
+    done: int = 0
+    fits: int = 0
+    began: float = field(default_factory=monotonic)
+    seconds: float | None = None
+    reused: bool = False
+    summary: str = ""
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the stage began, or that it took."""
+        return self.seconds if self.seconds is not None else monotonic() - self.began
+
+    @property
+    def rates(self) -> str:
+        """Frames, and fits or megabytes, a second; empty before the first shard."""
+        frames = self.done - self.done_before
+        if not frames or not self.elapsed:
+            return ""
+        parts = [f"{short(frames / self.elapsed)} frames/s"]
+        if self.fits:
+            parts.append(f"{short(self.fits / self.elapsed)} fits/s")
+        elif self.frame_bytes:
+            parts.append(f"{size(frames * self.frame_bytes / self.elapsed)}/s")
+        return "  ".join(parts)
+
+    @property
+    def remaining(self) -> str:
+        """The time left, or the time taken."""
+        if self.seconds is not None:
+            return "as before" if self.reused else clock(self.seconds)
+        frames = self.done - self.done_before
+        return f"{clock((self.frames - self.done) * self.elapsed / frames)} left" if frames else ""
+
+
+class Terminal:
+    """A sink that shows a run on the terminal; use it as a context manager.
+
+    Parameters
+    ----------
+    console
+        Where to write; standard error by default.
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True, highlight=False)
+        self.lines: dict[str, Line] = {}
+        self._printed, self._headed = monotonic(), False
+        live = self.console.is_terminal and not self.console.is_dumb_terminal
+        self._live = Live(get_renderable=self.table, console=self.console, refresh_per_second=4) if live else None
+
+    def __enter__(self) -> Terminal:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live:
+            self._live.stop()
+
+    def __call__(self, event: Event) -> None:
+        """Take an event and show it."""
+        match event:
+            case RunStarted():
+                if not self._headed:
+                    self._say(f"{event.source} → {event.output}", "bold")
+                self._headed = True
+                if event.dashboard:
+                    self._say(f"dashboard {event.dashboard}", "dim")
+            case StageStarted():
+                self.lines[event.stage] = Line(
+                    event.stage,
+                    event.frames,
+                    event.done_frames,
+                    event.frame_bytes,
+                    event.columns,
+                    done=event.done_frames,
+                )
+                self._plain(self._started(self.lines[event.stage]))
+            case ShardDone():
+                line = self.lines.setdefault(event.stage, Line(event.stage))
+                line.done += event.frames
+                line.fits += event.fits
+                if monotonic() - self._printed > _PLAIN_INTERVAL_S:
+                    parts = (f"{line.done}/{line.frames} frames", line.rates, line.remaining)
+                    self._plain(f"{line.stage}: " + ", ".join(filter(None, parts)))
+            case StageDone():
+                line = self.lines.setdefault(event.stage, Line(event.stage))
+                line.seconds, line.reused, line.summary = event.seconds, event.reused, event.summary
+                took = "done before" if event.reused else f"done in {clock(event.seconds)}"
+                self._plain(f"{line.stage}: " + ", ".join(filter(None, (took, line.rates, line.summary))))
+            case Warned():
+                self._say(f"warning: {event.message}", "yellow")
+            case RunDone():
+                self._end(event)
+
+    def table(self) -> Table:
+        """Return the lines as they stand now."""
+        grid = Table.grid(padding=(0, 2), expand=True)
+        for column in range(5):
+            grid.add_column(justify="right" if column > 2 else "left", no_wrap=True)
+        grid.add_column(no_wrap=True, ratio=1)  # of a narrow terminal, only the notes are cut
+        width = 24 if self.console.width >= 110 else 10
+        for line in self.lines.values():
+            finished = line.seconds is not None
+            dim = "dim" if line.reused else ""
+            total = max(line.frames, 1)
+            share = total if finished else line.done
+            bar = ProgressBar(total=total, completed=share, width=width, complete_style="cyan", finished_style="green")
+            count = f"{line.done}/{line.frames} frames" if line.frames else ""
+            note = "  ".join(filter(None, (line.rates, line.summary)))
+            grid.add_row(
+                Text("✓" if finished else "·", style="green" if finished else "cyan"),
+                Text(line.stage, style=dim or "bold"),
+                "" if line.reused else bar,
+                Text(count, style=dim),
+                Text(line.remaining, style=dim),
+                Text(note, style=dim),
+            )
+        return grid
+
+    def _started(self, line: Line) -> str:
+        parts = [
+            f"{line.frames} frames" if line.frames else "",
+            f"{line.columns} columns" if line.columns else "",
+            f"{line.done_before} frames done before" if line.done_before else "",
+        ]
+        return f"{line.stage}: " + (", ".join(filter(None, parts)) or "started")
+
+    def _end(self, event: RunDone) -> None:
+        if self._live:
+            self._live.refresh()
+            self._live.stop()
+        message = event.message or _ENDS.get(event.state, event.state)
+        styles = {"done": "green", "failed": "red"}
+        self._say(f"{message} ({clock(event.seconds)})", styles.get(event.state, "yellow"))
+
+    def _plain(self, text: str) -> None:
+        if self._live is None:
+            self._say(text)
+            self._printed = monotonic()
+
+    def _say(self, text: str, style: str = "") -> None:
+        self.console.print(Text(text, style=style), soft_wrap=True)
+
+
+def short(number: float) -> str:
+    """Return a number in three figures.
+
+    Examples
+    --------
+    >>> [short(number) for number in (0.1234, 12.34, 4810.0, 1.5e6)]
+    ['0.123', '12.3', '4.81k', '1.5M']
+    """
+    for scale, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= scale:
+            return f"{number / scale:.3g}{suffix}"
+    return f"{number:.3g}"
+
+
+def size(count: float) -> str:
+    """Return a number of bytes in three figures.
+
+    Examples
+    --------
+    >>> [size(count) for count in (512, 2.1e9)]
+    ['512 B', '2.1 GB']
+    """
+    text = short(count)
+    return f"{text[:-1]} {text[-1]}B" if text[-1].isalpha() else f"{text} B"
+
+
+def clock(seconds: float) -> str:
+    """Return a time as a person writes it.
+
+    Examples
+    --------
+    >>> [clock(seconds) for seconds in (0.42, 48, 75, 7325)]
+    ['0.4 s', '48 s', '1:15', '2:02:05']
+    """
+    if seconds < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
