@@ -1,0 +1,116 @@
+"""The documentation against the code: settings, commands, examples."""
+
+import contextlib
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import typing
+from pathlib import Path
+
+import pytest
+
+from tract_dask.settings import RunSettings
+from tract_dask.simulate import simulate_movie
+
+ROOT = Path(__file__).parents[1]
+PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+RUN_BY = "scripts/test"
+"""The one command that is not run here, since it is what runs this."""
+
+
+def blocks(document: str, language: str) -> list[str]:
+    """The fenced blocks of a document in one language."""
+    text = (ROOT / document).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def call(*command: str, folder: Path, timeout: int = 300) -> str:
+    """Run a command in a process group of its own, which ends with it; return what it printed."""
+    with (
+        tempfile.TemporaryFile("w+") as out,
+        tempfile.TemporaryFile("w+") as err,
+    ):  # a pipe would wait for background jobs
+        process = subprocess.Popen(
+            command, cwd=folder, env=os.environ | {"PATH": PATH}, stdout=out, stderr=err, start_new_session=True
+        )
+        try:
+            code = process.wait(timeout)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        out.seek(0)
+        err.seek(0)
+        printed = out.read()
+        assert code == 0, printed + err.read()
+    return printed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a small movie and the scripts of the checkout, in which a reader's commands run."""
+    place = tmp_path_factory.mktemp("reader")
+    simulate_movie(place / "movie.tif", n_frames=16, shape=(256, 256))
+    (place / "scripts").symlink_to(ROOT / "scripts")
+    return place
+
+
+def test_settings_doc_is_made_from_the_declarations():
+    made = call(sys.executable, str(ROOT / "scripts" / "make_settings_doc"), folder=ROOT)
+    assert (ROOT / "docs" / "settings.md").read_text(encoding="utf-8") == made, (
+        "run scripts/make_settings_doc > docs/settings.md"
+    )
+
+
+def test_every_setting_is_documented():
+    text = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    for group, kind in typing.get_type_hints(RunSettings).items():
+        assert f"## [{group}]" in text
+        for item in dataclasses.fields(kind):
+            assert item.metadata["description"], f"{group}.{item.name} has no description"
+            assert re.search(rf"^\| `{item.name}` .*{re.escape(item.metadata['description'])} \|$", text, re.MULTILINE)
+
+
+@pytest.mark.slow
+def test_commands_and_examples_of_the_readme(folder):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    commands = blocks("README.md", "bash")
+    assert commands
+    for block in commands:
+        assert RUN_BY not in block
+        call("bash", "-euo", "pipefail", "-c", block, folder=folder)
+    assert (folder / "demo_output" / "movie.tif").exists()
+    for name in re.findall(r"^\| (`.*?`) \|", text, flags=re.MULTILINE):
+        for path in re.findall(r"`(.*?)`", name):
+            assert (folder / "out" / path).exists(), path
+    for block in blocks("README.md", "python"):
+        call(sys.executable, "-c", block, folder=folder)
+
+
+@pytest.mark.slow
+def test_commands_of_the_cluster_recipe(folder):
+    for block in blocks("docs/cluster.md", "bash"):
+        call("bash", "-euo", "pipefail", "-c", block, folder=folder)
+    assert (folder / "out-cluster" / "results.zarr").is_dir()
+
+
+def test_links_lead_somewhere():
+    for document in [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text(encoding="utf-8")):
+            assert (document.parent / target).exists(), f"{document.name}: {target}"
+
+
+def test_every_script_is_run_by_the_checks():
+    scripts = list((ROOT / "scripts").iterdir())
+    callers = [ROOT / "README.md", ROOT / ".ci" / "run", *scripts, *(ROOT / "tests").glob("*.py")]
+    for script in scripts:
+        assert os.access(script, os.X_OK), script.name
+        texts = [file.read_text(encoding="utf-8") for file in callers if file != script]
+        assert any(re.search(rf"\b{script.name}\b", text) for text in texts), script.name
+
+
+def test_changelog_has_a_place_for_what_is_new():
+    assert "## [Unreleased]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

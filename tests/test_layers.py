@@ -1,0 +1,124 @@
+"""Who may import whom: the table of the design. An edge that is not in it fails."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "tract_dask"
+
+GROUND = {"errors", "settings", "schema", "progress"}
+STORES = GROUND | {"provenance", "stores", "shards"}
+MOVIE = STORES | {"io", "movie", "kernels"}
+STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds"}
+RUN = STAGES | {"cluster", "stages", "pipeline"}
+
+ALLOWED = {
+    "errors": set(),
+    "progress": set(),
+    "schema": {"errors"},
+    "settings": {"errors"},
+    "provenance": {"settings"},
+    "stores": {"errors"},
+    "shards": {"errors", "stores"},
+    "kernels": set(),
+    "io": STORES,
+    "layout": {"settings", "kernels"},
+    "ome": {"schema", "stores"},
+    "movie": STORES | {"ome"},
+    "conversion": STORES | {"io", "kernels", "layout", "ome"},
+    "passes": STORES | {"movie"},
+    "lattice": {"kernels"},
+    "seeds": GROUND,
+    "vacuum": GROUND | {"kernels"},
+    "measure": MOVIE,
+    "results": STORES,
+    "plots": GROUND | {"seeds"},
+    "drift": MOVIE | {"passes"},
+    "summing": MOVIE | {"passes"},
+    "columns": MOVIE | {"lattice", "seeds"},
+    "fit": MOVIE | {"measure", "results", "vacuum"},
+    "simulate": {"errors", "schema", "kernels"},
+    "cluster": {"errors", "settings"},
+    "stages": STAGES,
+    "pipeline": STAGES | {"cluster", "stages"},
+    "describe": RUN,
+    "demo": RUN | {"simulate"},
+    "options": {"settings"},
+    "terminal": {"progress"},
+    "cli": RUN | {"demo", "describe", "options", "terminal"},
+}
+"""What each room (a file or a folder of the package) may import from the others."""
+
+ABROAD = {"numpy", "numba"}
+"""What kernels may import from outside, beside the standard library."""
+
+
+def room_of(file: Path) -> str:
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(source: str, depth: int) -> tuple[set[str], set[str]]:
+    """Rooms of the package, and packages from outside, that a module imports; it lies ``depth`` folders down."""
+    rooms, outside = set(), set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.level > depth:
+            rooms |= {node.module.split(".")[0]} if node.module else {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            first, *rest = node.module.split(".")
+            if first == PACKAGE.name:
+                rooms |= {rest[0]} if rest else {alias.name for alias in node.names}
+            else:
+                outside.add(first)
+        elif isinstance(node, ast.Import):
+            names = [alias.name.split(".") for alias in node.names]
+            rooms |= {name[1] for name in names if name[0] == PACKAGE.name and len(name) > 1}
+            outside |= {name[0] for name in names if name[0] != PACKAGE.name}
+    return rooms, outside
+
+
+FILES = sorted(file for file in PACKAGE.rglob("*.py") if file != PACKAGE / "__init__.py")
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_imports_point_downwards(file):
+    room = room_of(file)
+    rooms, _ = imports(file.read_text(encoding="utf-8"), len(file.relative_to(PACKAGE).parts) - 1)
+    assert room in ALLOWED, f"{room} is new: say in the table what it may import"
+    assert rooms - {room} <= ALLOWED[room]
+
+
+@pytest.mark.parametrize("file", sorted((PACKAGE / "kernels").glob("*.py")), ids=lambda file: file.name)
+def test_kernels_know_only_numpy_and_numba(file):
+    _, outside = imports(file.read_text(encoding="utf-8"), 1)
+    assert outside - set(sys.stdlib_module_names) <= ABROAD
+
+
+def test_the_table_has_no_cycles():
+    def below(room: str, path: tuple[str, ...] = ()) -> None:
+        assert room not in path, f"a cycle: {' -> '.join((*path, room))}"
+        for other in ALLOWED[room]:
+            below(other, (*path, room))
+
+    for room in ALLOWED:
+        below(room)
+
+
+def test_every_room_of_the_table_is_there():
+    assert set(ALLOWED) == {room_of(file) for file in FILES}
+
+
+@pytest.mark.parametrize(
+    ("source", "depth", "rooms", "outside"),
+    [
+        ("from . import stores, schema", 0, {"stores", "schema"}, set()),
+        ("from .io import open_source\nimport numpy.linalg", 0, {"io"}, {"numpy"}),
+        ("from .source import Source\nfrom ..errors import TractError", 1, {"errors"}, set()),
+        ("from .. import fit", 1, {"fit"}, set()),
+        ("import tract_dask.cli\nfrom tract_dask.movie import Movie", 0, {"cli", "movie"}, set()),
+        ("def f():\n    from .pipeline import run", 0, {"pipeline"}, set()),
+    ],
+)
+def test_every_form_of_import_is_seen(source, depth, rooms, outside):
+    assert imports(source, depth) == (rooms, outside)
