@@ -20,7 +20,7 @@ ALLOWED = {
     "schema": {"errors"},
     "settings": {"errors"},
     "provenance": {"settings"},
-    "stores": {"errors"},
+    "stores": {"errors", "schema"},
     "shards": {"errors", "stores"},
     "kernels": set(),
     "io": STORES,

@@ -79,8 +79,6 @@ def test_align_does_not_depend_on_brightness(dy, dx, scale, offset):
     assert fit.converged
     assert (fit.dy, fit.dx) == pytest.approx((dy, dx), abs=0.02)  # the cubic's own error, below 1 % of a column's width
     assert fit.correlation == pytest.approx(1.0, abs=3e-3)  # single precision, over an offset of 50 amplitudes
-        1.0, abs=3e-3
-    )  # sums are in single precision, over an offset of 50 amplitudes
 
 
 def test_align_ignores_what_has_no_weight():

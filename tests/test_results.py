@@ -8,7 +8,7 @@ import xarray as xr
 
 from tract_dask import accepted, convert, fit_columns, open_movie, open_results
 from tract_dask.errors import StoreError
-from tract_dask.fit import fit_movie
+from tract_dask.fit import fit_movie, prepare
 from tract_dask.progress import ShardDone, StageDone
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
 
@@ -24,13 +24,19 @@ def movie(scene, tmp_path, npy):
     return open_movie(store)
 
 
+def fit_all(movie, scene, path, settings=None, **more):
+    columns = scene.columns()
+    job = prepare(movie, columns, scene.drift_dataset(), settings or FitSettings())
+    return fit_movie(movie, columns, job, path, **more)
+
+
 class Killed(BaseException):
     """Stands for the end of the process."""
 
 
 def test_stored_results_equal_the_lazy_ones(scene, movie, tmp_path):
     path = tmp_path / "results.zarr"
-    summary = fit_movie(movie, scene.columns(), scene.drift_dataset(), path)
+    summary = fit_all(movie, scene, path)
     lazy = fit_columns(movie, scene.columns(), scene.drift_dataset())
     stored = open_results(path)
     for name in lazy.data_vars:
@@ -45,7 +51,7 @@ def test_stored_results_equal_the_lazy_ones(scene, movie, tmp_path):
 
 def test_an_interrupted_fit_goes_on_to_the_same_numbers(scene, movie, tmp_path):
     whole, resumed = tmp_path / "whole.zarr", tmp_path / "resumed.zarr"
-    fit_movie(movie, scene.columns(), scene.drift_dataset(), whole)
+    fit_all(movie, scene, whole)
     seen: list[int] = []
 
     def kill_after_two(event):
@@ -55,16 +61,15 @@ def test_an_interrupted_fit_goes_on_to_the_same_numbers(scene, movie, tmp_path):
                 raise Killed
 
     with pytest.raises(Killed):
-        fit_movie(movie, scene.columns(), scene.drift_dataset(), resumed, on_event=kill_after_two)
+        fit_all(movie, scene, resumed, on_event=kill_after_two)
     with pytest.raises(StoreError, match="not all done"):
         open_results(resumed)
     partial = open_results(resumed, unfinished=True)
     assert np.isnan(partial.fit[-1]).all()
     rest: list[int] = []
-    fit_movie(
+    fit_all(
         movie,
-        scene.columns(),
-        scene.drift_dataset(),
+        scene,
         resumed,
         on_event=lambda e: rest.append(e.shard) if isinstance(e, ShardDone) else None,
     )
@@ -75,12 +80,10 @@ def test_an_interrupted_fit_goes_on_to_the_same_numbers(scene, movie, tmp_path):
 def test_a_finished_fit_is_reused_and_other_settings_are_not(scene, movie, tmp_path):
     path = tmp_path / "results.zarr"
     events = []
-    first = fit_movie(movie, scene.columns(), scene.drift_dataset(), path)
-    assert fit_movie(movie, scene.columns(), scene.drift_dataset(), path, on_event=events.append) == first
+    first = fit_all(movie, scene, path)
+    assert fit_all(movie, scene, path, on_event=events.append) == first
     assert events == [StageDone("fit", 0.0, reused=True)]
-    fit_movie(
-        movie, scene.columns(), scene.drift_dataset(), path, FitSettings(blur_sigma_px=0.0), on_event=events.append
-    )
+    fit_all(movie, scene, path, FitSettings(blur_sigma_px=0.0), on_event=events.append)
     assert sum(isinstance(event, ShardDone) for event in events) == len(movie.shards)
 
 

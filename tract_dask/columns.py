@@ -179,7 +179,7 @@ def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) ->
                 "Give it, or choose method auto",
             )
         given, where = read_columns_csv(settings.csv), settings.csv
-    seeds = _Seeds(positions(given), given["kind"].to_numpy().astype(np.str_), given["column_id"].to_numpy(), True)
+    seeds = _Seeds(positions(given), schema.texts(given["kind"].to_numpy()), given["column_id"].to_numpy(), True)
     _check_inside(seeds, scene.valid.shape, where)
     measured = (
         None if settings.spacing_px else _neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing

@@ -111,30 +111,25 @@ def fit_columns(
 
 
 def fit_movie(
-    movie: Movie,
-    columns: xr.Dataset,
-    drift: xr.Dataset | None,
-    path: Path,
-    settings: FitSettings | None = None,
-    *,
-    summed: xr.Dataset | None = None,
-    refine_columns: int | None = 10,
-    client: Client | None = None,
-    on_event: Sink = silent,
+    movie: Movie, columns: xr.Dataset, job: Job, path: Path, *, client: Client | None = None, on_event: Sink = silent
 ) -> FitSummary:
     """Fit every column in every frame into the store at ``path``; go on where an earlier call stopped.
 
-    The arguments are those of :func:`fit_columns`. A finished store with the same key is left as it is; one with
-    another key is made anew.
+    A finished store with the same key is left as it is, but for its calibration; one with another key is made anew.
+
+    Parameters
+    ----------
+    job
+        From :func:`prepare`, with the same movie and columns.
+    client
+        The cluster to run on; None runs in this process.
     """
     started = perf_counter()
-    settings = settings or FitSettings()
-    job = prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
     key = fit_key(movie, columns, job)
     about = stores.attributes(path)
     n_columns = len(job.reference)
     if about.get("key") == key and about.get("complete"):
-        stores.update_attributes(path, **_calibration(movie))
+        results.calibrate(path, frame_times(movie), **_calibration(movie))
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
     if about.get("key") != key:
@@ -145,7 +140,7 @@ def fit_movie(
             job.drift,
             frame_times(movie),
             movie.shards[0].frames,
-            **provenance(key, settings, str(movie.path)),
+            **provenance(key, job.settings, str(movie.path)),
             **_calibration(movie),
             window=job.window,
             vacuum=job.vacuum,

@@ -163,7 +163,7 @@ def _option(group: str, field: tuple[dataclasses.Field[Any], Any], cls: type[cli
     item, annotation = field
     meta = item.metadata
     flag = meta["flag"] or "--" + item.name.replace("_", "-")
-    plain = _plain(annotation)
+    plain = declared.plain_type(annotation)
     more: dict[str, Any] = {}
     if plain is bool:
         flag = f"{flag}/--no-{flag[2:]}"
@@ -174,13 +174,6 @@ def _option(group: str, field: tuple[dataclasses.Field[Any], Any], cls: type[cli
         more["metavar"] = None if meta["choices"] else _metavar(item.name, plain, annotation, meta["unit"])
     text = meta["description"] + (f" [{default}]" if default else "") + "."
     return click.option(flag, f"{group}__{item.name}", default=None, cls=cls, help=text, **more)
-
-
-def _plain(annotation: Any) -> Any:
-    """Return the class behind ``X | None`` and ``tuple[...]``."""
-    if declared.is_optional(annotation):
-        annotation = next(kind for kind in typing.get_args(annotation) if kind is not type(None))
-    return typing.get_origin(annotation) or annotation
 
 
 def _click_type(plain: Any, annotation: Any) -> Any:

@@ -105,7 +105,7 @@ def _kinds(columns: xr.Dataset) -> dict[str, str]:
 
 
 def _legend(columns: xr.Dataset) -> list[Line2D]:
-    kinds, states = columns["kind"].to_numpy().astype(np.str_), _states(columns)
+    kinds, states = schema.texts(columns["kind"].to_numpy()), _states(columns)
     handles = []
     for kind, colour in _kinds(columns).items():
         count = int((kinds == kind).sum())
@@ -134,7 +134,7 @@ def _handle(marker: str, colour: str, label: str) -> Line2D:
 def _mark(axes: Axes, columns: xr.Dataset, points_per_px: float) -> None:
     """Draw a marker around each column, about half the spacing wide, and its ID."""
     places, states = positions(columns), _states(columns)
-    kinds = columns["kind"].to_numpy().astype(np.str_)
+    kinds = schema.texts(columns["kind"].to_numpy())
     spacing = float(columns.attrs.get("spacing_px") or 20 / points_per_px)
     diameter = float(np.clip(0.5 * spacing * points_per_px, 3, 26))
     width = float(np.clip(diameter / 12, 0.7, 1.6))

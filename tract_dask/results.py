@@ -90,6 +90,13 @@ def write(path: Path, shard: Shard, values: dict[str, np.ndarray[Any, Any]]) -> 
             target[shard.start : shard.stop] = array
 
 
+def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
+    """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
+    if any(stores.attributes(path).get(name) != value for name, value in about.items()):
+        zarr.open_array(str(path / "time"), mode="r+")[...] = time
+        stores.update_attributes(path, **about)
+
+
 def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     """Return the tracks at ``path`` as a lazy Dataset over (frame, column_id, parameter).
 

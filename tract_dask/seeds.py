@@ -44,7 +44,7 @@ def column_dataset(
     values: dict[str, Any] = {
         "x_ref": xy[:, 0].copy(),
         "y_ref": xy[:, 1].copy(),
-        "kind": np.array(kinds, dtype=np.str_),
+        "kind": schema.texts(kinds),
         "fit_ref": np.full((len(xy), len(schema.PARAMETERS)), np.nan) if fit is None else np.asarray(fit, np.float64),
         "status_ref": np.zeros(len(xy), np.uint8) if status is None else np.asarray(status, np.uint8),
     }

@@ -63,7 +63,7 @@ class Settings:
         for item in dataclasses.fields(self):
             value = getattr(self, item.name)
             value = tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
-            if isinstance(value, int) and not isinstance(value, bool) and _kind(kinds[item.name]) is float:
+            if isinstance(value, int) and not isinstance(value, bool) and plain_type(kinds[item.name]) is float:
                 value = float(value)
             object.__setattr__(self, item.name, value)
             if not isinstance(value, Settings):
@@ -306,7 +306,7 @@ def load(path: Path) -> RunSettings:
         ) from error
 
 
-def _kind(annotation: Any) -> Any:
+def plain_type(annotation: Any) -> Any:
     """Return the plain type behind ``X | None`` and ``tuple[...]``."""
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         annotation = next(arg for arg in typing.get_args(annotation) if arg is not type(None))
@@ -323,7 +323,7 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
     where = f"setting {item.name} ({owner.__name__})"
     if value is None and is_optional(annotation):
         return
-    kind = _kind(annotation)
+    kind = plain_type(annotation)
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise SettingsError(
             "the value is of the wrong type", where, kind.__name__, repr(value), meta.get("description", "")

@@ -27,7 +27,7 @@ from .io import FrameSource
 from .movie import Movie, open_movie
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
-from .schema import Status, texts
+from .schema import Status
 from .seeds import write_columns_csv
 from .settings import ColumnSettings, DriftSettings, FitSettings, RunSettings, Settings
 from .shards import journal_beside
@@ -166,17 +166,8 @@ def fit_stage(
 ) -> fit.FitSummary:
     """Fit every column in every frame into ``path``."""
     job = fit.prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
-    return fit.fit_movie(
-        movie,
-        columns,
-        drift,
-        path,
-        settings,
-        summed=summed,
-        refine_columns=refine_columns,
-        client=None if _is_done(path, fit.fit_key(movie, columns, job)) else workers(),
-        on_event=on_event,
-    )
+    client = None if _is_done(path, fit.fit_key(movie, columns, job)) else workers()
+    return fit.fit_movie(movie, columns, job, path, client=client, on_event=on_event)
 
 
 def _kept(
@@ -215,17 +206,16 @@ def _kept(
 def _save(dataset: xr.Dataset, path: Path, key: str, settings: Settings, kind: str, **more: Any) -> None:
     about = provenance(key, settings) | {"kind": kind, "complete": True} | more
     known = {name: value for name, value in dataset.attrs.items() if value is not None}
-    words = {name: variable for name, variable in dataset.variables.items() if variable.dtype.kind == "U"}
-    stored = dataset.assign({name: (word.dims, texts(word.to_numpy()), word.attrs) for name, word in words.items()})
+    stored = dataset.copy()
     stored.attrs = stores.json_ready(known | {stores.ATTRIBUTE: about})
     stores.write_dataset(stored, path)
 
 
 def _reopened(store: Path) -> xr.Dataset:
-    """Return the columns in ``store`` as they were found: without provenance, kinds as objects."""
+    """Return the columns in ``store`` as they were found: without provenance."""
     found = stores.open_dataset(store)
     del found.attrs[stores.ATTRIBUTE]
-    return found.assign(kind=found["kind"].astype(object))
+    return found
 
 
 def _render(columns: xr.Dataset, csv: Path) -> bytes:

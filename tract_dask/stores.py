@@ -18,6 +18,7 @@ import xarray as xr
 import zarr
 
 from .errors import DestinationError, StoreError
+from .schema import texts
 
 ATTRIBUTE = "tract_dask"
 """Name of the attribute under which every store keeps its provenance and its own metadata."""
@@ -76,6 +77,8 @@ def write_aside(path: Path, data: bytes) -> None:
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     """Write a small Dataset as a Zarr store, whole or not at all."""
+    words = {name: variable for name, variable in dataset.variables.items() if variable.dtype.kind == "U"}
+    dataset = dataset.assign({name: (word.dims, texts(word.to_numpy()), word.attrs) for name, word in words.items()})
     aside = path.with_name(f".{path.name}.partial")
     with disk_errors(path):
         remove(aside)
@@ -85,7 +88,7 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
 
 
 def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
-    """Return the Dataset of a store, or only some of its variables, in memory.
+    """Return the Dataset of a store, or only some of its variables, in memory; text as objects.
 
     Raises
     ------
@@ -96,7 +99,10 @@ def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
         dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
         raise StoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
-    return (dataset[list(only)] if only else dataset).load()
+    dataset = (dataset[list(only)] if only else dataset).load()
+    return dataset.assign(
+        {name: word.astype(object) for name, word in dataset.data_vars.items() if word.dtype.kind == "T"}
+    )
 
 
 def remove(path: Path) -> None:
@@ -152,10 +158,14 @@ def check_free_space(path: Path, needed: int) -> None:
         raise DestinationError(
             "the disk is too small for this",
             str(path),
-            f"{needed / 1e9:.1f} GB free",
-            f"{free / 1e9:.1f} GB",
+            f"about {_readable(needed)} free",
+            _readable(free),
             "Free some space, or choose another disk",
         )
+
+
+def _readable(size: int) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
 @contextmanager
