@@ -201,7 +201,7 @@ def test_resumed_and_distributed_runs_are_identical(tmp_path):
             (tmp_path / "a" / name / f"{k}.npy").unlink()
     events: list[Any] = []
     xr.testing.assert_identical(whole, estimate_drift(movie, journal=tmp_path / "a", on_event=events.append))
-    assert events[0] == StageStarted("drift", 42, 24, 0, SHAPE[0] * SHAPE[1])
+    assert events[0] == StageStarted("drift", 42, 24, 0, SHAPE[0] * SHAPE[1], 3)
     assert sum(isinstance(event, ShardDone) for event in events) == 6
     shutil.rmtree(tmp_path / "a" / "refine-1")
     shutil.rmtree(tmp_path / "a" / "refine-2")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tract_dask import convert, fit_columns, open_movie
+from tract_dask import accepted, convert, fit_columns, open_movie
 from tract_dask.errors import SettingsError
 from tract_dask.measure import intensities
 from tract_dask.schema import Status
@@ -89,6 +89,15 @@ def test_absent_columns_are_flagged(scene, make_movie):
     lost = tracks.status.to_numpy() != 0
     assert lost[~present].all()
     assert lost[present].mean() <= 0.01
+
+
+def test_a_sigma_on_its_bound_is_flagged_and_accepted(scene, make_movie):
+    columns = scene.columns()
+    columns["fit_ref"][:, [3, 4]] *= 0.6  # the true widths, blurred, are beyond 1.3 times these
+    tracks = fit_columns(make_movie(scene.counts()), columns, scene.drift_dataset(), refine_columns=None).compute()
+    assert (tracks.status == Status.SHAPE_AT_BOUND).mean() > 0.95
+    assert accepted(tracks).fit.sel(parameter="x").notnull().mean() > 0.95
+    assert (tracks.fit.sel(parameter="sigma_a") <= 1.3 * 0.6 * scene.sigma_a * (1 + 1e-9)).all()
 
 
 def test_noise_is_that_of_blurred_vacuum(scene, make_movie):

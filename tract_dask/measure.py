@@ -148,6 +148,7 @@ def _fit(
             blur_sigma_px=settings.blur_sigma_px,
             tolerance_px=settings.tolerance_px,
             max_iterations=settings.max_iterations,
+            counting=settings.counting,
         )
         with np.errstate(invalid="ignore"):  # windows of bad frames
             residual = np.sqrt((1 - fits.r_squared) * windows.var(axis=(1, 2), dtype=np.float64))

@@ -51,7 +51,7 @@ class Passes:
             if shard.index in known
         )
         frame_bytes = int(np.prod(self.movie.shape[1:])) * self.movie.dtype.itemsize
-        self.on_event(StageStarted(self.name, self.runs * self.movie.n_frames, done, 0, frame_bytes))
+        self.on_event(StageStarted(self.name, self.runs * self.movie.n_frames, done, 0, frame_bytes, self.runs))
 
     def run(self, task: Any, shards: tuple[Shard, ...], journal: Journal) -> dict[int, Payload]:
         """Run the task on the shards that are not done; return the payloads of all."""

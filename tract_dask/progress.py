@@ -25,13 +25,17 @@ class RunStarted:
 
 @dataclass(frozen=True)
 class StageStarted:
-    """A stage begins; ``done_frames`` of ``frames`` were finished by an earlier run."""
+    """A stage begins; ``done_frames`` of ``frames`` were finished by an earlier run.
+
+    A stage that goes over the movie several times (``passes``) counts every frame as often.
+    """
 
     stage: str
     frames: int
     done_frames: int = 0
     columns: int = 0
     frame_bytes: int = 0
+    passes: int = 1
 
 
 @dataclass(frozen=True)

@@ -189,6 +189,9 @@ class FitSettings(Settings):
         5.0, "Amplitude stays below this factor of that in the summed image", low=1.01, high=1e6
     )
     threshold: float = setting(2.0, "Accept a fit where the amplitude exceeds this times the noise", low=0, high=100)
+    counting: bool = setting(
+        True, "For standard errors: the noise grows with the signal, as counts do; else it is the same in every pixel"
+    )
     intensity_scale: str = setting(
         "paper",
         "Share of a Gaussian inside two sigma: the paper's box (0.9111) or the ellipse (0.8647)",

@@ -30,6 +30,7 @@ class Line:
     done_before: int = 0
     frame_bytes: int = 0
     columns: int = 0
+    passes: int = 1
     done: int = 0
     fits: int = 0
     began: float = field(default_factory=monotonic)
@@ -43,9 +44,14 @@ class Line:
         return self.seconds if self.seconds is not None else monotonic() - self.began
 
     @property
+    def count(self) -> str:
+        """How many frames are done, of how many."""
+        return f"{self.done // self.passes}/{self.frames // self.passes} frames" if self.frames else ""
+
+    @property
     def rates(self) -> str:
         """Frames, and fits or megabytes, a second; empty before the first shard."""
-        frames = self.done - self.done_before
+        frames = (self.done - self.done_before) / self.passes
         if not frames or not self.elapsed:
             return ""
         parts = [f"{short(frames / self.elapsed)} frames/s"]
@@ -107,7 +113,8 @@ class Terminal:
                     event.done_frames,
                     event.frame_bytes,
                     event.columns,
-                    done=event.done_frames,
+                    event.passes,
+                    event.done_frames,
                 )
                 self._plain(self._started(self.lines[event.stage]))
             case ShardDone():
@@ -115,7 +122,7 @@ class Terminal:
                 line.done += event.frames
                 line.fits += event.fits
                 if monotonic() - self._printed > _PLAIN_INTERVAL_S:
-                    parts = (f"{line.done}/{line.frames} frames", line.rates, line.remaining)
+                    parts = (line.count, line.rates, line.remaining)
                     self._plain(f"{line.stage}: " + ", ".join(filter(None, parts)))
             case StageDone():
                 line = self.lines.setdefault(event.stage, Line(event.stage))
@@ -140,13 +147,12 @@ class Terminal:
             total = max(line.frames, 1)
             share = total if finished else line.done
             bar = ProgressBar(total=total, completed=share, width=width, complete_style="cyan", finished_style="green")
-            count = f"{line.done}/{line.frames} frames" if line.frames else ""
             note = "  ".join(filter(None, (line.rates, line.summary)))
             grid.add_row(
                 Text("✓" if finished else "·", style="green" if finished else "cyan"),
                 Text(line.stage, style=dim or "bold"),
                 "" if line.reused else bar,
-                Text(count, style=dim),
+                Text(line.count, style=dim),
                 Text(line.remaining, style=dim),
                 Text(note, style=dim),
             )
@@ -154,9 +160,9 @@ class Terminal:
 
     def _started(self, line: Line) -> str:
         parts = [
-            f"{line.frames} frames" if line.frames else "",
+            f"{line.frames // line.passes} frames" if line.frames else "",
             f"{line.columns} columns" if line.columns else "",
-            f"{line.done_before} frames done before" if line.done_before else "",
+            f"{line.done_before // line.passes} frames done before" if line.done_before else "",
         ]
         return f"{line.stage}: " + (", ".join(filter(None, parts)) or "started")
 
