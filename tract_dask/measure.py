@@ -217,9 +217,9 @@ def _read(
 def _common_motion(fits: GaussianFits, status: NDArray[np.uint8], drift: Floats, job: Job) -> Floats:
     """Return how far the accepted columns of each frame moved together, (frames, 2): what the drift had missed.
 
-    Zero unless it stands out of its own error with 99.9 % certainty (chi-squared of both axes above 13.8): registration,
-    which sees every pixel, is otherwise the better estimate. Zero, too, where fewer than ``refine_columns`` are
-    accepted.
+    Zero unless it stands out of its own error with 99.9 % certainty (chi-squared of both axes above 13.8):
+    registration, which sees every pixel, is otherwise the better estimate. Zero, too, where fewer than
+    ``refine_columns`` are accepted.
     """
     motion = np.zeros_like(drift)
     if job.refine_columns is None:
