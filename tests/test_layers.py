@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "tract_dask"
 GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"provenance", "stores", "shards"}
 MOVIE = STORES | {"io", "movie", "kernels"}
-STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds"}
+STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline"}
 
 ALLOWED = {
@@ -31,14 +31,15 @@ ALLOWED = {
     "passes": STORES | {"movie"},
     "lattice": {"kernels"},
     "seeds": GROUND,
+    "windows": {"errors"},
     "vacuum": GROUND | {"kernels"},
     "measure": MOVIE,
     "results": STORES,
     "plots": GROUND | {"seeds"},
     "drift": MOVIE | {"passes"},
     "summing": MOVIE | {"passes"},
-    "columns": MOVIE | {"lattice", "seeds"},
-    "fit": MOVIE | {"measure", "results", "vacuum"},
+    "columns": MOVIE | {"lattice", "seeds", "windows"},
+    "fit": MOVIE | {"measure", "results", "vacuum", "windows"},
     "simulate": {"errors", "schema", "kernels"},
     "cluster": {"errors", "settings"},
     "stages": STAGES,

@@ -311,10 +311,14 @@ def test_columns_need_a_table_and_do_not_replace_a_foreign_one(job, tmp_path):
     assert mine.read_text() == "x,y\n1,2\n"
 
 
-def test_seeds_outside_the_image_keep_what_is_done(job, tmp_path):
+@pytest.mark.parametrize(
+    ("columns", "fit"), [({"method": "csv"}, {}), ({}, {"window_px": 20}), ({}, {"window_px": 301})]
+)
+def test_what_cannot_fit_the_movie_is_refused_before_any_work(job, tmp_path, columns, fit):
     seeds = tmp_path / "seeds.csv"
     seeds.write_text("x,y\n1000,20\n")
-    with pytest.raises(SettingsError):
-        job(change(columns={"method": "csv", "csv": str(seeds)}))
-    job()
-    assert "convert" not in job.worked
+    columns = columns | {"csv": str(seeds)} if columns else {}
+    with pytest.raises(SettingsError, match=r"outside the image|window cannot be used"):
+        job(change(columns=columns, fit=fit))
+    assert job.events == []
+    assert not job.output.exists()

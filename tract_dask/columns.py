@@ -26,6 +26,7 @@ from .seeds import (
     write_columns_csv,
 )
 from .settings import ColumnSettings
+from .windows import check_window, default_window
 
 __all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
 
@@ -122,7 +123,8 @@ def find_columns(
     schema.validate(summed, schema.SUM, "summed image")
     scene = _scene(summed, settings, blur_sigma_px)
     found, spacing = _seeds(scene, settings, seeds)
-    window = _window(window_px, spacing, scene.image.shape)
+    reason = "" if window_px else f", from a spacing of {spacing:.4g} px"
+    window = check_window(window_px or default_window(spacing), scene.image.shape, reason)
     search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
     centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
     raised, _ = relief(scene.image, spacing, blur_sigma_px)
@@ -180,7 +182,7 @@ def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) ->
             )
         given, where = read_columns_csv(settings.csv), settings.csv
     seeds = _Seeds(positions(given), schema.texts(given["kind"].to_numpy()), given["column_id"].to_numpy(), True)
-    _check_inside(seeds, scene.valid.shape, where)
+    check_inside(given, scene.valid.shape, where)
     measured = (
         None if settings.spacing_px else _neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing
     )
@@ -242,32 +244,27 @@ def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float
     return seeds, settings.spacing_px or _neighbour_distance(distinct) or finest
 
 
-def _check_inside(seeds: _Seeds, shape: tuple[int, ...], where: str) -> None:
-    size = np.array(shape[::-1])
-    outside = np.flatnonzero(~((seeds.places >= -0.5) & (seeds.places < size - 0.5)).all(axis=1))
+def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> None:
+    """Check that the columns lie inside an image of ``shape`` (y, x).
+
+    Raises
+    ------
+    SettingsError
+        With their number, and the first that does not.
+    """
+    size, places = np.array(shape[::-1]), positions(columns)
+    outside = np.flatnonzero(~((places >= -0.5) & (places < size - 0.5)).all(axis=1))
     if len(outside):
         first = int(outside[0])
-        x, y = seeds.places[first]
+        x, y = places[first]
         raise SettingsError(
-            f"{len(outside)} of {len(seeds.places)} columns lie outside the image",
+            f"{len(outside)} of {len(places)} columns lie outside the image",
             where,
             f"x from 0 to {size[0] - 1}, y from 0 to {size[1] - 1}",
-            f"column {seeds.number[first]} at x {x:g}, y {y:g}" + (" first" if len(outside) > 1 else ""),
+            f"column {columns['column_id'].to_numpy()[first]} at x {x:g}, y {y:g}"
+            + (" first" if len(outside) > 1 else ""),
             "Give positions in px of the summed image (check that x and y are not exchanged), or remove these columns",
         )
-
-
-def _window(window_px: int | None, spacing: float, shape: tuple[int, ...]) -> int:
-    window = window_px or max(7, 2 * round(0.25 * spacing) + 1)
-    if window % 2 == 0 or window < 5 or window > min(shape):
-        raise SettingsError(
-            "the window cannot be used",
-            "setting window_px (FitSettings)",
-            f"an odd number from 5 to {min(shape)}, the shorter side of the image",
-            f"{window}" + ("" if window_px else f", from a spacing of {spacing:.4g} px"),
-            "Give window_px, or spacing_px if that spacing is wrong",
-        )
-    return window
 
 
 def _corners(places: Places, window: int, valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -25,6 +25,7 @@ from .schema import REJECTED, Status, X, Y
 from .settings import FitSettings, from_toml
 from .shards import Journal, Payload, Shard, journal_beside, run_shards
 from .vacuum import check_box, find_vacuum
+from .windows import check_window, default_window
 
 
 @dataclass(frozen=True)
@@ -179,26 +180,9 @@ def prepare(
 ) -> Job:
     """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
     schema.validate(columns, schema.COLUMNS, "columns")
-    shift = np.zeros((movie.n_frames, 2))
-    if drift is not None:
-        schema.validate(drift, schema.DRIFT, "drift")
-        shift = drift["drift"].to_numpy().astype(np.float64)
-        if shift.shape != (movie.n_frames, 2):
-            raise SettingsError(
-                "the drift is of another movie",
-                "drift",
-                f"{movie.n_frames} frames",
-                f"{shift.shape[0]}",
-                "Measure it on this one",
-            )
-    window = settings.window_px or int(columns.attrs.get("window_px") or default_window(columns))
-    if window % 2 == 0 or window > min(movie.shape[1:]):
-        raise SettingsError(
-            "the window cannot be used",
-            "setting window_px (FitSettings)",
-            f"an odd number up to {min(movie.shape[1:])}",
-            str(window),
-        )
+    shift = schema.drift_of(drift, movie.n_frames)
+    window = settings.window_px or int(columns.attrs.get("window_px") or default_window(_spacing(columns)))
+    check_window(window, movie.shape[1:])
     box = settings.vacuum_box
     if box is not None:
         check_box(box, movie.shape[1:], shift)
@@ -216,11 +200,8 @@ def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
     return stage_key(movie.key, numbers.tobytes(), rest, job.settings)
 
 
-def default_window(columns: xr.Dataset) -> int:
-    """Return the side of a window from the columns' spacing: half the median distance to the nearest neighbour, odd.
-
-    On CeO2 in [110] it reaches the flanks of the oxygen columns, which lie at 0.42 of that distance.
-    """
+def _spacing(columns: xr.Dataset) -> float:
+    """Return the median distance from a column to its nearest neighbour, px."""
     place = np.stack([columns["y_ref"].to_numpy(), columns["x_ref"].to_numpy()], axis=1)
     if len(place) < 2:
         raise SettingsError(
@@ -230,8 +211,7 @@ def default_window(columns: xr.Dataset) -> int:
             "one column",
             "Give --window-px",
         )
-    nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
-    return max(7, 2 * round(0.25 * float(np.median(nearest))) + 1)
+    return float(np.median(np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]))
 
 
 def frame_times(movie: Movie) -> Floats:

@@ -18,6 +18,7 @@ from distributed import Client
 
 from . import stores
 from .cluster import LazyClient, local_memory_limit, memory_budget
+from .columns import check_inside
 from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError
 from .fit import FitSummary
@@ -29,6 +30,7 @@ from .seeds import read_columns_csv
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import journal_beside, split
 from .stages import columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
+from .windows import check_window
 
 WORKER_BYTES = 300_000_000
 """What a worker process takes before it has read a pixel."""
@@ -422,7 +424,10 @@ def _check_inputs(source: FrameSource, settings: RunSettings) -> None:
     if settings.drift.method == "csv":
         read_drift_csv(_required(settings.drift.csv, "--drift-csv"), source.shape[0])
     if settings.columns.method == "csv":
-        read_columns_csv(_required(settings.columns.csv, "--columns"))
+        table = _required(settings.columns.csv, "--columns")
+        check_inside(read_columns_csv(table), source.shape[1:], str(table))
+    if settings.fit.window_px is not None:
+        check_window(settings.fit.window_px, source.shape[1:])
     local_memory_limit(settings.cluster)
 
 
@@ -458,7 +463,6 @@ def _check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> 
             str(before),
             "Choose another place, or say --overwrite",
         )
-    root.mkdir(parents=True, exist_ok=True)
     stores.check_destination(outputs.movie, overwrite=overwrite)
 
 

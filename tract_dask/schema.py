@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from .errors import StoreError
+from .errors import SettingsError, StoreError
 
 PARAMETERS = ("amplitude", "x", "y", "sigma_a", "sigma_b", "theta", "background")
 """The seven parameters of Equation 1, in the order that is used everywhere."""
@@ -199,6 +200,19 @@ def validate(dataset: xr.Dataset, variables: dict[str, Variable], where: str) ->
     return dataset
 
 
-def empty(variable: Variable, sizes: dict[str, int]) -> np.ndarray[Any, Any]:
-    """Return a new array of ``variable``'s dtype and dimensions, filled with its fill value."""
-    return np.full(tuple(sizes[dim] for dim in variable.dims), variable.fill, dtype=variable.dtype)
+def drift_of(drift: xr.Dataset | None, n_frames: int) -> NDArray[np.float64]:
+    """Return the drift of every frame of a movie, (n_frames, 2) in px; zero where there is none.
+
+    Raises
+    ------
+    SettingsError
+        Where it is that of another movie.
+    """
+    if drift is None:
+        return np.zeros((n_frames, 2))
+    shift = validate(drift, DRIFT, "drift")["drift"].to_numpy().astype(np.float64)
+    if len(shift) != n_frames:
+        raise SettingsError(
+            "the drift is of another movie", "drift", f"{n_frames} frames", f"{len(shift)}", "Measure it on this one"
+        )
+    return shift

@@ -13,7 +13,6 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import schema
-from .errors import SettingsError
 from .kernels.registration import add_shifted, overlap
 from .movie import Movie
 from .passes import Passes, save_array
@@ -94,20 +93,9 @@ def sum_image(
 
 def _whole_pixels(movie: Movie, drift: xr.Dataset | None) -> tuple[NDArray[np.int64], Bools]:
     """Return the drift of every frame in whole pixels, and which frames are to be summed."""
-    if drift is None:
-        return np.zeros((movie.n_frames, 2), np.int64), np.ones(movie.n_frames, np.bool_)
-    schema.validate(drift, schema.DRIFT, "drift")
-    if drift.sizes["frame"] != movie.n_frames:
-        raise SettingsError(
-            "the drift is of another movie",
-            "drift",
-            f"{movie.n_frames} frames",
-            f"{drift.sizes['frame']}",
-            "Measure it on this one",
-        )
-    used = drift["quality"].to_numpy() > 0.0
-    used |= not used.any()
-    return np.rint(drift["drift"].to_numpy()).astype(np.int64), used
+    shift = np.rint(schema.drift_of(drift, movie.n_frames)).astype(np.int64)
+    used = np.ones(movie.n_frames, np.bool_) if drift is None else drift["quality"].to_numpy() > 0.0
+    return shift, used | (not used.any())
 
 
 def _accumulator(movie: Movie, n_frames: int) -> np.dtype[Any]:
