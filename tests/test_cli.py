@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from importlib.metadata import entry_points
 
 import numpy as np
@@ -252,7 +253,9 @@ def test_interrupted_run_ends_cleanly(npy, scene, tmp_path, number):
     scene.n_frames = 12
     movie, out = npy(np.tile(scene.counts(), (80, 1, 1))), tmp_path / "out"
     command = [sys.executable, "-m", "tract_dask.cli", "run", movie, out, "--workers", "1", "--shard-mb", "1"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs do not hear Ctrl-C
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True, preexec_fn=heard) as process:
         events = out / "events.jsonl"
         deadline = time.monotonic() + 120
         while not (events.exists() and "ShardDone" in events.read_text()):
