@@ -119,7 +119,10 @@ def run(source: str, output: Path, settings: RunSettings, *, plan_only: bool, ov
 @common_options
 @setting_options("source", "metadata")
 def inspect(path: str, settings: RunSettings, *, as_json: bool) -> None:
-    """Print what PATH holds: a movie in any format, or a store or folder that tract-dask wrote."""
+    """Print what PATH holds.
+
+    It may be a movie in any format, or a store or folder that tract-dask wrote.
+    """
     from .describe import describe
 
     _show(describe(path, settings), as_json=as_json)
@@ -185,7 +188,10 @@ def columns(
 def fit(
     movie: Path, columns: Path, results: Path, settings: RunSettings, *, drift_from: Path | None, as_json: bool
 ) -> None:
-    """Fit COLUMNS (.csv) in every frame of the store MOVIE, into RESULTS (.zarr)."""
+    """Fit COLUMNS (.csv) in all frames of MOVIE, into RESULTS.
+
+    MOVIE and RESULTS are stores (.zarr); what RESULTS has from an interrupted fit is kept.
+    """
     from . import pipeline
 
     with _progress() as on_event:
@@ -200,7 +206,10 @@ def fit(
 @common_options
 @setting_options("convert", "drift", "columns", "fit", "cluster")
 def demo(folder: Path, settings: RunSettings, *, frames: int, as_json: bool) -> None:
-    """Simulate a drifting low-dose movie of CeO2, track it, and compare with the truth; all in FOLDER."""
+    """Track a simulated movie, and compare with its truth.
+
+    The movie is a drifting low-dose one of CeO2; everything goes to FOLDER.
+    """
     from .demo import run_demo
 
     with _progress() as on_event:
