@@ -47,6 +47,10 @@ class MemoryMovie:
         return len(self.pixels)
 
     @property
+    def frame_bytes(self):
+        return self.pixels[0].nbytes
+
+    @property
     def shards(self):
         return split(self.n_frames, self.frames_per_shard)
 

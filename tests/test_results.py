@@ -102,3 +102,11 @@ def test_accepted_masks_what_is_flagged(scene, movie):
 def test_opening_what_is_not_there_says_so(tmp_path):
     with pytest.raises(StoreError, match="no results here"):
         open_results(tmp_path)
+
+
+def test_a_journal_that_a_killed_run_left_is_removed(scene, movie, tmp_path):
+    path = tmp_path / "results.zarr"
+    fit_all(movie, scene, path)
+    (tmp_path / "results.zarr.journal").mkdir()
+    fit_all(movie, scene, path)
+    assert not (tmp_path / "results.zarr.journal").exists()

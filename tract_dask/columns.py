@@ -26,7 +26,7 @@ from .seeds import (
     write_columns_csv,
 )
 from .settings import ColumnSettings
-from .windows import check_window, default_window
+from .windows import check_window, default_window, neighbour_distance
 
 __all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
 
@@ -141,7 +141,7 @@ def find_columns(
     columns = column_dataset(places[kept], found.kind[kept].tolist(), ids, fit[kept], status[kept])
     name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
     columns.attrs = {
-        "spacing_px": _neighbour_distance(places[kept]) or spacing,
+        "spacing_px": neighbour_distance(places[kept]) or spacing,
         "window_px": window,
         "contrast": settings.contrast,
         "blur_sigma_px": float(blur_sigma_px),
@@ -183,9 +183,7 @@ def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) ->
         given, where = read_columns_csv(settings.csv), settings.csv
     seeds = _Seeds(positions(given), schema.texts(given["kind"].to_numpy()), given["column_id"].to_numpy(), True)
     check_inside(given, scene.valid.shape, where)
-    measured = (
-        None if settings.spacing_px else _neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing
-    )
+    measured = None if settings.spacing_px else neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing
     return seeds, settings.spacing_px or measured or 0.0
 
 
@@ -206,7 +204,7 @@ def _automatic(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
             f"Check the contrast (now {settings.contrast}) and spacing_px, or give the columns in a CSV file",
         )
     number = np.arange(1, len(places) + 1)
-    return _Seeds(places, np.full(len(places), ""), number, False), _neighbour_distance(places) or spacing
+    return _Seeds(places, np.full(len(places), ""), number, False), neighbour_distance(places) or spacing
 
 
 def _lattice_of(scene: _Scene, settings: ColumnSettings) -> Lattice:
@@ -241,7 +239,7 @@ def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float
     finest = settings.spacing_px or min(lattice.attrs["spacing_px"] for lattice in lattices)
     shared = _twins(seeds.places, _SAME * finest)
     distinct = np.delete(seeds.places, list(shared), axis=0)
-    return seeds, settings.spacing_px or _neighbour_distance(distinct) or finest
+    return seeds, settings.spacing_px or neighbour_distance(distinct) or finest
 
 
 def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> None:
@@ -371,11 +369,3 @@ def _reading_order(places: Places, thickness: float) -> NDArray[np.int64]:
             top, current = places[place, 1], current + 1
         row[place] = current
     return np.lexsort((places[:, 0], row))
-
-
-def _neighbour_distance(places: Places) -> float | None:
-    """Return the median distance to the nearest neighbour, px; None for a single place."""
-    if len(places) < 2:
-        return None
-    distances = np.asarray(cKDTree(places).query(places, k=2)[0])
-    return float(np.median(distances[:, 1])) or None

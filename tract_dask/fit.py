@@ -13,7 +13,6 @@ import numpy as np
 import xarray as xr
 from distributed import Client
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from . import results, schema, stores
 from .errors import SettingsError
@@ -25,7 +24,7 @@ from .schema import REJECTED, Status, X, Y
 from .settings import FitSettings, from_toml
 from .shards import Journal, Payload, Shard, journal_beside, run_shards
 from .vacuum import check_box, find_vacuum
-from .windows import check_window, default_window
+from .windows import check_window, default_window, neighbour_distance
 
 
 @dataclass(frozen=True)
@@ -128,8 +127,8 @@ def fit_movie(
     started = perf_counter()
     key = fit_key(movie, columns, job)
     about = stores.attributes(path)
-    n_columns = len(job.reference)
     if about.get("key") == key and about.get("complete"):
+        stores.remove(journal_beside(path))  # of a run that was killed just before it had removed it
         results.calibrate(path, frame_times(movie), **_calibration(movie))
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
@@ -150,8 +149,7 @@ def fit_movie(
     journal = Journal(journal_beside(path), key)
     done = journal.done()
     done_frames = sum(shard.frames for shard in movie.shards if shard.index in done)
-    frame_bytes = int(np.prod(movie.shape[1:])) * movie.dtype.itemsize
-    on_event(StageStarted("fit", movie.n_frames, done_frames, n_columns, frame_bytes))
+    on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
     payloads = run_shards(
         partial(_fit_task, movie.path, path, key),
         movie.shards,
@@ -203,7 +201,8 @@ def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
 def _spacing(columns: xr.Dataset) -> float:
     """Return the median distance from a column to its nearest neighbour, px."""
     place = np.stack([columns["y_ref"].to_numpy(), columns["x_ref"].to_numpy()], axis=1)
-    if len(place) < 2:
+    distance = neighbour_distance(place)
+    if distance is None:
         raise SettingsError(
             "one column alone does not tell how large its window should be",
             "setting window_px (FitSettings)",
@@ -211,7 +210,7 @@ def _spacing(columns: xr.Dataset) -> float:
             "one column",
             "Give --window-px",
         )
-    return float(np.median(np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]))
+    return distance
 
 
 def frame_times(movie: Movie) -> Floats:

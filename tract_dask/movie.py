@@ -103,6 +103,11 @@ class Movie:
         return self.shape[0]
 
     @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame, uncompressed."""
+        return self.shape[1] * self.shape[2] * self.dtype.itemsize
+
+    @property
     def shards(self) -> tuple[Shard, ...]:
         """The shards, in order: every frame in exactly one."""
         return split(self.n_frames, self.frames_per_shard)

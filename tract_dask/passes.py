@@ -50,8 +50,9 @@ class Passes:
             for shard in shards
             if shard.index in known
         )
-        frame_bytes = int(np.prod(self.movie.shape[1:])) * self.movie.dtype.itemsize
-        self.on_event(StageStarted(self.name, self.runs * self.movie.n_frames, done, 0, frame_bytes, self.runs))
+        self.on_event(
+            StageStarted(self.name, self.runs * self.movie.n_frames, done, 0, self.movie.frame_bytes, self.runs)
+        )
 
     def run(self, task: Any, shards: tuple[Shard, ...], journal: Journal) -> dict[int, Payload]:
         """Run the task on the shards that are not done; return the payloads of all."""

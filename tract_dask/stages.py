@@ -190,6 +190,7 @@ def _kept(
             "Choose another place",
         )
     if _is_done(path, key):
+        stores.remove(journal_beside(path))  # of a run that was killed just before it had removed it
         on_event(StageDone(stage, 0.0, reused=True))
         dataset = stores.open_dataset(path)
         if dataset.attrs.get("pixel_size_pm") == movie.pixel_size_pm:

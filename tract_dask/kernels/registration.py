@@ -361,7 +361,7 @@ def _step(m: Floats) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _cubic(t: float) -> tuple[Floats, Floats]:  # pragma: no cover
+def _cubic(t: float) -> tuple[Floats, Floats]:
     """Weights of Catmull and Rom's cubic at -1, 0, 1, 2 for a point ``t`` after 0, and of its derivative."""
     value = np.array(
         [
@@ -383,7 +383,7 @@ def _cubic(t: float) -> tuple[Floats, Floats]:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def moments(frame: Image, template: Image, weight: Image, dy: float, dx: float) -> Floats:  # pragma: no cover
+def moments(frame: Image, template: Image, weight: Image, dy: float, dx: float) -> Floats:
     """Return the weighted sums of products that the regression of ``frame`` on the shifted template needs.
 
     With T the shifted template and Ty, Tx its derivatives: sums of 1, T, Ty, Tx, f, TT, fT, TTy, TTx, TyTy, TyTx,
