@@ -70,9 +70,14 @@ class Scene:
         frames = [self.frame(shift, here) for shift, here in zip(self.drift, shown, strict=True)]
         return rng.poisson(frames).astype(dtype)
 
-    def columns(self) -> xr.Dataset:
-        """The true columns, as a columns Dataset."""
+    def columns(self, blur_sigma_px: float = 2.0) -> xr.Dataset:
+        """The true columns, as a columns Dataset: what a fit finds in the blurred scene.
+
+        The blur adds its variance to those of the Gaussian, and leaves the volume.
+        """
         truth = self.parameters
+        truth[:, 3:5] = np.sqrt(truth[:, 3:5] ** 2 + blur_sigma_px**2)
+        truth[:, 0] *= self.sigma_a * self.sigma_b / truth[:, 3:5].prod(axis=1)
         return xr.Dataset(
             {
                 "x_ref": ("column_id", truth[:, 1]),
@@ -82,7 +87,7 @@ class Scene:
                 "status_ref": ("column_id", np.zeros(len(truth), np.uint8)),
             },
             coords={"column_id": np.arange(1, len(truth) + 1)},
-            attrs={"window_px": 19},
+            attrs={"window_px": 19, "blur_sigma_px": blur_sigma_px},
         )
 
     def drift_dataset(self, error: np.ndarray | float = 0.0) -> xr.Dataset:

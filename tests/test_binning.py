@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tract_dask.kernels.binning import measure_frame
+from tract_dask.kernels.binning import FrameMeter
 
 DTYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8")
 RELATIVE = 1e-10
@@ -20,6 +20,10 @@ def binned(frame, factor):
         finite = [part[np.isfinite(part)] for part in parts]
         rows.append([part.mean() if part.size else np.nan for part in finite])
     return np.array(rows, dtype=np.float64)
+
+
+def measure_frame(frame, n_levels):
+    return FrameMeter(frame.shape, frame.dtype, n_levels).measure(frame)
 
 
 def assert_measured(frame, n_levels):
@@ -92,3 +96,12 @@ def test_a_view_is_measured_as_its_copy():
     assert_measured(view, 2)
     again = measure_frame(view.copy(), 2)
     assert measure_frame(view, 2)[:5] == again[:5]
+
+
+def test_one_meter_measures_many_frames():
+    frames = np.random.default_rng(5).poisson(9, (3, 45, 70)).astype(np.uint16)
+    meter = FrameMeter(frames.shape[1:], frames.dtype, 2)
+    for frame in frames:
+        measures, alone = meter.measure(frame), measure_frame(frame, 2)
+        assert measures[:5] == alone[:5]
+        assert all(np.array_equal(one, other) for one, other in zip(measures.levels, alone.levels, strict=True))

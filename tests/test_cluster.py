@@ -4,11 +4,12 @@ import importlib.metadata
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from tract_dask import cluster
+from tract_dask import cluster, forkserver
 from tract_dask.errors import ClusterError, SettingsError
 from tract_dask.settings import ClusterSettings
 
@@ -48,8 +49,35 @@ def test_local_workers_have_one_thread_each_and_the_memory_that_was_set():
         (found,) = client.run(environment).values()
         names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS", "BLOSC_NTHREADS")
         assert {found[name] for name in names} == {"1"}
-        assert found["MALLOC_TRIM_THRESHOLD_"] == "65536"
+        assert found["MALLOC_MMAP_THRESHOLD_"] == "33554432"
         assert client.dashboard_link.startswith("http://127.0.0.1:")
+
+
+@pytest.mark.skipif(not forkserver.AVAILABLE, reason="workers are spawned here")
+def test_forked_workers_have_everything_imported_and_the_driver_keeps_its_environment():
+    before = environment()
+    forkserver.start()
+    assert environment() == before
+    with cluster.connect(ClusterSettings(workers=1)) as client:
+        (modules,) = client.run(lambda: set(sys.modules)).values()
+    assert {"tract_dask.conversion", "tract_dask.drift", "tract_dask.fit"} <= modules
+
+
+@pytest.mark.skipif(not forkserver.AVAILABLE, reason="workers are spawned here")
+def test_what_the_fork_server_imports_starts_no_thread():
+    """A thread would not live on in the workers, but what it holds locked would stay so."""
+    forkserver.start()
+    with cluster.connect(ClusterSettings(workers=1)) as client:
+        (server,) = client.run(os.getppid).values()
+        assert len(list(Path(f"/proc/{server}/task").iterdir())) == 1
+
+
+def test_workers_are_spawned_where_there_is_no_fork_server(monkeypatch):
+    monkeypatch.setattr(forkserver, "AVAILABLE", False)
+    with cluster.connect(ClusterSettings(workers=1)) as client:
+        assert client.submit(sum, [1, 2]).result() == 3
+        (parent,) = client.run(os.getppid).values()
+    assert parent == os.getpid()
 
 
 def test_scheduler_file_of_a_running_scheduler(tmp_path):

@@ -25,7 +25,10 @@ def results_from(truth: xr.Dataset, error_px: np.ndarray, offset_px: float) -> x
     for name, k in (("x", 1), ("y", 0)):
         fit[..., PARAMETERS.index(name)] = cerium[name].to_numpy() - drift[:, k, None] + error_px
     gone = cerium["atoms"].to_numpy() == 0
-    per_column = {name: (RESULTS[name].dims, np.ones(fit.shape[:2])) for name in ("intensity", "intensity_error")}
+    per_column = {
+        name: (RESULTS[name].dims, np.ones(fit.shape[:2]))
+        for name in ("intensity", "intensity_error", "intensity_stderr")
+    }
     return xr.Dataset(
         per_column
         | {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ class MemoryMovie:
     gain: float = 1.0
     pixel_size_pm: float | None = 10.0
     key: str = "key"
+    tile: tuple[int, int, int] = (16, 256, 256)
     reads: list[int] = field(default_factory=list)
 
     @property
@@ -57,6 +58,13 @@ class MemoryMovie:
     def read(self, start, stop, y=slice(None), x=slice(None)):
         self.reads.append(stop - start)
         return self.pixels[start:stop, y, x].copy()
+
+    def tiles(self, shard):
+        depth, height, width = self.tile
+        for start in range(shard.start, shard.stop, depth):
+            for top, left in product(range(0, self.shape[1], height), range(0, self.shape[2], width)):
+                stop = min(start + depth, shard.stop)
+                yield start, top, left, self.pixels[start:stop, top : top + height, left : left + width].copy()
 
     def read_binned(self, factor, start, stop):
         ny, nx = self.shape[1:]
@@ -195,23 +203,37 @@ def test_a_movie_of_one_frame():
     assert found["quality"] > 0.9
 
 
+class Stopped(Exception):
+    """Raised to interrupt a stage."""
+
+
+def stop_after(n):
+    """An event sink that lets n parts through."""
+    seen = []
+
+    def sink(event):
+        seen.append(isinstance(event, ShardDone))
+        if sum(seen) == n:
+            raise Stopped
+
+    return sink
+
+
 def test_resumed_and_distributed_runs_are_identical(tmp_path):
-    truth = walk(14, 1.0)
-    movie = MemoryMovie(counts(truth, 4.0), 3)
-    whole = estimate_drift(movie, journal=tmp_path / "a")
-    for name in ("follow", "refine-1", "refine-2"):
-        for k in (1, 3):
-            (tmp_path / "a" / name / f"{k}.json").unlink()
-            (tmp_path / "a" / name / f"{k}.npy").unlink()
-    events: list[Any] = []
-    xr.testing.assert_identical(whole, estimate_drift(movie, journal=tmp_path / "a", on_event=events.append))
-    assert events[0] == StageStarted("drift", 42, 24, 0, SHAPE[0] * SHAPE[1], 3)
-    assert sum(isinstance(event, ShardDone) for event in events) == 6
-    shutil.rmtree(tmp_path / "a" / "refine-1")
-    shutil.rmtree(tmp_path / "a" / "refine-2")
+    """Fourteen frames make seven parts of two, each of which two runs go through."""
+    movie = MemoryMovie(counts(walk(14, 1.0), 4.0), 3)
+    whole = estimate_drift(movie, journal=tmp_path / "whole")
+    for interrupted in (3, 9):
+        folder = tmp_path / str(interrupted)
+        with pytest.raises(Stopped):
+            estimate_drift(movie, journal=folder, on_event=stop_after(interrupted))
+        events: list[Any] = []
+        xr.testing.assert_identical(whole, estimate_drift(movie, journal=folder, on_event=events.append))
+        assert events[0] == StageStarted("drift", 28, 2 * interrupted, 0, SHAPE[0] * SHAPE[1], 2)
+        assert sum(isinstance(event, ShardDone) for event in events) == 14 - interrupted
     with Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client:
-        xr.testing.assert_identical(whole, estimate_drift(movie, journal=tmp_path / "a", client=client))
-    estimate_drift(movie, journal=tmp_path / "a", on_event=events.append)
+        xr.testing.assert_identical(whole, estimate_drift(movie, client=client))
+    estimate_drift(movie, journal=tmp_path / "whole", on_event=events.append)
     assert isinstance(events[-1], StageDone)
     assert events[-1].reused
 
@@ -295,16 +317,13 @@ def direct_sum(pixels, drift, used=None):
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32"])
-@pytest.mark.parametrize("block", [1 << 26, 512])
-def test_sum_is_the_mean_of_the_moved_frames(dtype, block, monkeypatch):
-    monkeypatch.setattr("tract_dask.summing._BLOCK_BYTES", block)
-    monkeypatch.setattr("tract_dask.summing._CHUNK_FRAMES", 2)
-    monkeypatch.setattr("tract_dask.summing._CHUNK_ROWS", 4)
+@pytest.mark.parametrize("tile", [(2, 32, 32), (1, 4, 5)])
+def test_sum_is_the_mean_of_the_moved_frames(dtype, tile):
     rng = np.random.default_rng(6)
     pixels = rng.integers(0, 200, (40, 17, 13)).astype(dtype)
     drift = rng.uniform(-6, 6, (40, 2))
     drift[3] = 30, 0  # wholly outside
-    found = sum_image(MemoryMovie(pixels, 2, gain=0.5), drift_dataset(drift))
+    found = sum_image(MemoryMovie(pixels, 2, gain=0.5, tile=tile), drift_dataset(drift))
     image, exposure = direct_sum(pixels, drift)
     np.testing.assert_array_equal(found["exposure"], exposure)
     np.testing.assert_array_equal(found["image"], 0.5 * image)
@@ -336,14 +355,14 @@ def test_sum_is_the_same_by_any_way(tmp_path):
     rng = np.random.default_rng(8)
     movie = MemoryMovie(rng.normal(size=(35, 20, 20)).astype(np.float32), 2)
     drift = drift_dataset(rng.uniform(-2, 2, (35, 2)))
-    whole = sum_image(movie, drift, journal=tmp_path)
-    for k in (0, 5):
-        (tmp_path / "parts" / f"{k}.json").unlink()
+    whole = sum_image(movie, drift)
+    with pytest.raises(Stopped):
+        sum_image(movie, drift, journal=tmp_path, on_event=stop_after(7))
     events: list[Any] = []
     xr.testing.assert_identical(whole, sum_image(movie, drift, journal=tmp_path, on_event=events.append))
     assert isinstance(events[0], StageStarted)
-    assert events[0].done_frames == 35 - 4 - 4
-    assert [event.frames for event in events if isinstance(event, ShardDone)] == [4, 4]
+    assert events[0].done_frames == 7 * 4
+    assert [event.frames for event in events if isinstance(event, ShardDone)] == [4, 3]
     with Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client:
         xr.testing.assert_identical(whole, sum_image(movie, drift, client=client))
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from tract_dask.kernels.filters import blur, cut_windows, gaussian_kernel
+from tract_dask.kernels.filters import Tiles, blur, cut_windows, gaussian_kernel
 
 SCIPY_RELATIVE = 1e-5
 
@@ -92,4 +92,29 @@ def test_wrong_shapes_and_pixels_are_refused():
     with pytest.raises(ValueError, match="real numbers"):
         blur(np.zeros((3, 3), complex), 1.0)
     with pytest.raises(ValueError, match="corners"):
-        cut_windows(np.zeros((2, 9, 9)), [[1]], [[1]], 3, 1.0)
+        cut_windows(np.zeros((1, 9, 9)), [[1], [1]], [[1], [1]], 3, 1.0)
+    with pytest.raises(ValueError, match="frames must be"):
+        cut_windows(np.zeros((9, 9)), [[1]], [[1]], 3, 1.0)
+
+
+@pytest.mark.parametrize("tile", [(40, 47), (16, 16), (7, 30), (64, 64)])
+@pytest.mark.parametrize("sigma", [0.0, 2.0])
+def test_windows_from_tiles_are_those_from_frames(tile, sigma):
+    frames, size = frames_of("u2"), 15
+    rows, columns = (-(-length // side) for length, side in zip(frames.shape[1:], tile, strict=True))
+    padded = np.zeros((2, rows * tile[0], columns * tile[1]), frames.dtype)
+    padded[:, :40, :47] = frames
+    pixels = padded.reshape(2, rows, tile[0], columns, tile[1]).transpose(1, 3, 0, 2, 4).reshape(-1, 2, *tile)
+    order = np.random.default_rng(1).permutation(rows * columns)
+    place = np.argsort(order).reshape(rows, columns)
+    y, x = np.array([[0, 25, 12, 13, 30]]), np.array([[0, 32, 9, 20, 1]])
+    tiles = Tiles(np.ascontiguousarray(pixels[order]), place, (40, 47))
+    windows = cut_windows(tiles, y, x, size, sigma, 1.3, first=1)
+    np.testing.assert_array_equal(windows, cut_windows(frames[1:], y, x, size, sigma, 1.3))
+
+
+def test_a_missing_tile_is_told():
+    tiles = Tiles(np.ones((1, 1, 20, 20), np.uint16), np.array([[0, -1]]), (20, 40))
+    assert (cut_windows(tiles, [[3]], [[3]], 9, 1.0) > 0).all()
+    with pytest.raises(ValueError, match="tile that is missing"):
+        cut_windows(tiles, [[3]], [[9]], 9, 1.0)

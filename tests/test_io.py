@@ -11,7 +11,7 @@ import mrcfile
 import numpy as np
 import pytest
 import tifffile
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tract_dask.io import READERS, open_cached, open_source
@@ -348,6 +348,7 @@ def test_every_suffix_is_documented() -> None:
     assert [suffix for suffix in READERS if f"`{suffix}`" not in text] == []
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(0, 40), unique=True, min_size=1, max_size=12), st.integers(0, 12), st.integers(0, 12))
 def test_frames_anywhere_in_a_file(tmp_path_factory: pytest.TempPathFactory, places: list[int], a: int, b: int) -> None:
     """Runs of neighbours and lone frames, in any order, are read as slicing would."""

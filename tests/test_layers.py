@@ -24,35 +24,37 @@ ALLOWED = {
     "shards": {"errors", "stores"},
     "kernels": set(),
     "io": STORES,
-    "layout": {"settings", "kernels"},
+    "shard_files": set(),
+    "layout": {"settings", "kernels", "shard_files"},
     "ome": {"schema", "stores"},
-    "movie": STORES | {"ome"},
-    "conversion": STORES | {"io", "kernels", "layout", "ome"},
+    "movie": STORES | {"kernels", "ome", "shard_files"},
+    "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files"},
     "passes": STORES | {"movie"},
     "lattice": {"kernels"},
     "seeds": GROUND,
     "windows": {"errors"},
     "vacuum": GROUND | {"kernels"},
     "measure": MOVIE,
-    "results": STORES,
+    "results": STORES | {"shard_files"},
     "plots": GROUND | {"seeds"},
     "drift": MOVIE | {"passes"},
     "summing": MOVIE | {"passes"},
     "columns": MOVIE | {"lattice", "seeds", "windows"},
     "fit": MOVIE | {"measure", "results", "vacuum", "windows"},
     "simulate": {"errors", "schema", "kernels"},
-    "cluster": {"errors", "settings"},
+    "cluster": {"errors", "settings", "forkserver"},
+    "forkserver": set(),
     "stages": STAGES,
     "pipeline": STAGES | {"cluster", "stages"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "options": {"settings"},
     "terminal": {"progress"},
-    "cli": RUN | {"demo", "describe", "options", "terminal"},
+    "cli": RUN | {"demo", "describe", "forkserver", "options", "terminal"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 
-ABROAD = {"numpy", "numba"}
+ABROAD = {"numpy", "numba", "llvmlite"}
 """What kernels may import from outside, beside the standard library."""
 
 

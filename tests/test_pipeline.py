@@ -289,7 +289,9 @@ def test_single_stages_end_as_the_run_does(base, tmp_path):
     summary = pipeline.run_fit(movie, columns, results, SETTINGS, drift, client=base.client)
     assert summary.fits == expected.sizes["frame"] * expected.sizes["column_id"]
     again = open_results(results).load()
-    np.testing.assert_allclose(again["fit"], expected["fit"], atol=1e-3)
+    place = {"parameter": ["x", "y"]}  # shapes are found anew, from the table
+    np.testing.assert_allclose(again["fit"].sel(place), expected["fit"].sel(place), atol=2e-3)
+    np.testing.assert_allclose(again["intensity"], expected["intensity"], rtol=5e-3)
     assert columns.with_suffix(".png").exists()
 
 

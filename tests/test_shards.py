@@ -1,16 +1,21 @@
-"""The loop that keeps workers busy, on a cluster."""
+"""The unit of work, the journal, and the loop that keeps workers busy, on a cluster."""
 
 from __future__ import annotations
 
 import threading
 import time
+from functools import partial
+from pathlib import Path
 
+import numpy as np
 import pytest
 from distributed import Client, LocalCluster
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tract_dask import shards
 from tract_dask.errors import ClusterError, StoreError
-from tract_dask.shards import Journal, Shard, run_shards, split
+from tract_dask.shards import Journal, Shard, run_shards, split, stream_shards
 
 
 @pytest.fixture
@@ -23,6 +28,12 @@ def count(shard: Shard) -> dict[str, int]:
     return {"frames": shard.frames}
 
 
+def note(folder: Path, shard: Shard) -> dict[str, int]:
+    with (folder / "ran").open("a") as file:
+        file.write(f"{shard.index}\n")
+    return {}
+
+
 def fail_at_three(shard: Shard) -> dict[str, int]:
     if shard.index == 3:
         raise StoreError("the third shard is damaged")
@@ -32,6 +43,16 @@ def fail_at_three(shard: Shard) -> dict[str, int]:
 def wait_long(shard: Shard) -> dict[str, int]:
     time.sleep(0.2)
     return {}
+
+
+@given(st.integers(1, 300), st.integers(1, 40))
+def test_shards_are_a_sequence_that_is_made_as_it_is_read(n_frames, per_shard):
+    found = split(n_frames, per_shard)
+    assert list(found) == [found[k] for k in range(len(found))]
+    assert found[-1].stop == n_frames
+    assert found[1:] == tuple(found)[1:]
+    with pytest.raises(IndexError):
+        found[len(found)]
 
 
 def test_every_shard_runs_once_and_is_recorded(cluster, tmp_path):
@@ -50,11 +71,71 @@ def test_every_shard_runs_once_and_is_recorded(cluster, tmp_path):
     assert sum(payload["frames"] for payload in journal.done().values()) == 100
 
 
+def test_thousands_of_small_shards_each_run_once(cluster, tmp_path):
+    journal, taken = Journal(tmp_path / "journal", "key"), []
+    journal.record(Shard(7, 7, 8), {})
+    with Client(cluster) as client:
+        stream_shards(
+            partial(note, tmp_path),
+            split(5000, 1),
+            lambda shard, _: taken.append(shard.index),
+            journal=journal,
+            name="note",
+            client=client,
+        )
+    assert taken[0] == 7
+    assert sorted(taken) == list(range(5000))
+    assert sorted(map(int, (tmp_path / "ran").read_text().split())) == [k for k in range(5000) if k != 7]
+
+
+def test_a_batch_ends_when_its_time_is_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "_BATCH_S", 0.3)
+    journal = Journal(tmp_path / "journal", "key")
+    payloads, seconds = shards._work(wait_long, split(100, 1), journal, np.arange(4, 90))
+    assert sorted(journal.done()) == list(range(4, 4 + len(payloads)))
+    assert 0 < len(payloads) <= 2
+    assert seconds > 0.3
+
+
+def test_what_a_batch_leaves_comes_first_again():
+    queue = shards._Queue(np.arange(10))
+    batch = queue.take(6)
+    queue.give_back(batch[2:])
+    assert queue.left == 8
+    assert queue.take(3).tolist() == [2, 3, 4]
+    assert queue.take(3).tolist() == [5]
+    assert queue.take(9).tolist() == [6, 7, 8, 9]
+    assert queue.left == 0
+
+
+def test_the_torn_line_of_a_killed_process_is_no_entry(tmp_path):
+    journal = Journal(tmp_path / "journal", "key")
+    journal.record(Shard(0, 0, 4), {"fits": 1})
+    (file,) = journal.path.glob("*.jsonl")
+    with file.open("ab") as log:
+        log.write(b'\n[1, {"fi')
+    journal.record(Shard(2, 8, 10), {"fits": 3})
+    journal.record(Shard(2, 8, 10), {"fits": 3})
+    assert journal.done() == {0: {"fits": 1}, 2: {"fits": 3}}
+    assert journal.frames_done(split(10, 4)) == 6
+
+
 def test_the_error_of_a_task_is_the_error_of_the_stage(cluster, tmp_path):
     journal = Journal(tmp_path / "journal", "key")
     with Client(cluster) as client, pytest.raises(StoreError, match="third shard"):
         run_shards(fail_at_three, split(100, 3), journal=journal, name="fail", client=client)
     assert 3 not in journal.done()
+
+
+def test_whoever_takes_the_payloads_may_stop_the_work(cluster, tmp_path):
+    journal = Journal(tmp_path / "journal", "key")
+
+    def stop(shard, payload):
+        raise KeyboardInterrupt
+
+    with Client(cluster) as client, pytest.raises(KeyboardInterrupt):
+        stream_shards(wait_long, split(100, 1), stop, journal=journal, name="wait", client=client)
+    assert 0 < len(journal.done()) < 100
 
 
 def test_a_cluster_that_loses_all_its_workers_is_given_up(cluster, tmp_path, monkeypatch):

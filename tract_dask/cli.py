@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -107,8 +108,7 @@ def run(source: str, output: Path, settings: RunSettings, *, plan_only: bool, ov
 
     Run it again to go on where it was stopped; changed settings redo only what they affect.
     """
-    from . import pipeline
-
+    pipeline = _pipeline(settings)
     with _progress() as on_event:
         outcome = pipeline.run(source, output, settings, on_event=on_event, overwrite=overwrite, plan_only=plan_only)
     _show_outcome(outcome, as_json=as_json)
@@ -136,8 +136,7 @@ def inspect(path: str, settings: RunSettings, *, as_json: bool) -> None:
 @setting_options("source", "metadata", "convert", "cluster")
 def convert(source: str, destination: Path, settings: RunSettings, *, overwrite: bool, as_json: bool) -> None:
     """Convert the movie SOURCE to the store DESTINATION (.zarr)."""
-    from . import pipeline
-
+    pipeline = _pipeline(settings)
     with _progress() as on_event:
         pipeline.run_convert(source, destination, settings, on_event=on_event, overwrite=overwrite)
     _show_store(destination, as_json=as_json)
@@ -150,8 +149,7 @@ def convert(source: str, destination: Path, settings: RunSettings, *, overwrite:
 @setting_options("drift", "cluster")
 def drift(movie: Path, output: Path, settings: RunSettings, *, as_json: bool) -> None:
     """Measure the drift of the store MOVIE into OUTPUT (.zarr)."""
-    from . import pipeline
-
+    pipeline = _pipeline(settings)
     with _progress() as on_event:
         pipeline.run_drift(movie, output, settings, on_event=on_event)
     _show_store(output, as_json=as_json)
@@ -171,8 +169,7 @@ def columns(
 
     They are looked for in the movie's drift-corrected sum; a figure of them is written beside the table.
     """
-    from . import pipeline
-
+    pipeline = _pipeline(settings)
     with _progress() as on_event:
         pipeline.run_columns(movie, output, settings, drift_from, on_event=on_event, overwrite=overwrite)
     _show_store(output.with_suffix(".zarr"), as_json=as_json)
@@ -192,8 +189,7 @@ def fit(
 
     MOVIE and RESULTS are stores (.zarr); what RESULTS has from an interrupted fit is kept.
     """
-    from . import pipeline
-
+    pipeline = _pipeline(settings)
     with _progress() as on_event:
         summary = pipeline.run_fit(movie, columns, results, settings, drift_from, on_event=on_event)
     _show_store(results, as_json=as_json)
@@ -215,6 +211,17 @@ def demo(folder: Path, settings: RunSettings, *, frames: int, as_json: bool) -> 
     with _progress() as on_event:
         found = run_demo(folder, frames, settings, on_event=on_event)
     _show(found, as_json=as_json)
+
+
+def _pipeline(settings: RunSettings) -> ModuleType:
+    """Import the pipeline; the server of the local workers, if there are to be any, imports at the same time."""
+    from . import forkserver
+
+    if not (settings.cluster.scheduler or settings.cluster.scheduler_file):
+        forkserver.start()
+    from . import pipeline
+
+    return pipeline
 
 
 @contextmanager

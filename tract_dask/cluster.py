@@ -17,28 +17,21 @@ from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 from distributed.system import MEMORY_LIMIT
 
+from . import forkserver
 from .errors import ClusterError, SettingsError
 from .settings import ClusterSettings
 
 PACKAGE = "tract_dask"
 
-_THREAD_VARIABLES = (
-    "NUMBA_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "RAYON_NUM_THREADS",
-    "BLOSC_NTHREADS",
-    "ZARR_THREADING__MAX_WORKERS",
-)
 _NANNY_ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
+_PROCESS_METHOD = "distributed.worker.multiprocessing-method"
 
 
 @contextmanager
 def connect(settings: ClusterSettings | None = None, *, timeout_s: float = 10.0) -> Iterator[Client]:
     """Yield a client of the cluster that ``settings`` name: a local one by default, which ends with the block.
 
-    Scripts that use the local cluster need the usual ``if __name__ == "__main__":`` guard, since workers are spawned.
+    Scripts that use the local cluster need the usual ``if __name__ == "__main__":`` guard, since workers import them.
 
     Raises
     ------
@@ -56,12 +49,8 @@ def connect(settings: ClusterSettings | None = None, *, timeout_s: float = 10.0)
             f"{settings.scheduler} and {settings.scheduler_file}",
             "Leave one out",
         )
-    if settings.scheduler or settings.scheduler_file:
-        with _remote(settings, timeout_s) as client:
-            yield client
-    else:
-        with _local(settings) as client:
-            yield client
+    with _local(settings) if _is_local(settings) else _remote(settings, timeout_s) as client:
+        yield client
 
 
 class LazyClient:
@@ -84,6 +73,8 @@ class LazyClient:
         on_connect: Callable[[Client], None] = lambda client: None,
     ) -> None:
         self._settings, self._given, self._on_connect = settings, client, on_connect
+        if client is None and _is_local(settings or ClusterSettings()):
+            forkserver.start()  # it imports while this process prepares the work
         self._stack = ExitStack()
         self._client: Client | None = None
 
@@ -141,6 +132,10 @@ def check_workers(client: Client, *, timeout_s: float = 30.0) -> None:
             )
 
 
+def _is_local(settings: ClusterSettings) -> bool:
+    return not (settings.scheduler or settings.scheduler_file)
+
+
 def memory_budget(client: Client) -> int | None:
     """Return the bytes that one task may use: the smallest memory limit of a worker, shared among its threads.
 
@@ -186,8 +181,11 @@ def local_memory_limit(settings: ClusterSettings) -> int:
 @contextmanager
 def _local(settings: ClusterSettings) -> Iterator[Client]:
     """Start workers of one thread each, whose libraries use one thread each."""
-    environment = dict(dask.config.get(_NANNY_ENVIRONMENT)) | dict.fromkeys(_THREAD_VARIABLES, 1)
-    with dask.config.set({_NANNY_ENVIRONMENT: environment}), warnings.catch_warnings():
+    changes: dict[str, Any] = {_NANNY_ENVIRONMENT: dict(dask.config.get(_NANNY_ENVIRONMENT)) | forkserver.ENVIRONMENT}
+    if forkserver.AVAILABLE:
+        changes[_PROCESS_METHOD] = "forkserver"
+    forkserver.start()
+    with dask.config.set(changes), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Port .* is already in use")
         cluster = LocalCluster(
             n_workers=local_workers(settings),

@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 
 from . import schema
 from .errors import InputError, SettingsError
-from .kernels.filters import blur, cut_windows
+from .kernels.filters import cut_windows
 from .kernels.fitting import GaussianFits, fit_gaussians
 from .kernels.peaks import centroids, climb
-from .lattice import Lattice, damping, find_lattice, find_peaks, pixel_noise, relief
+from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .schema import Status
 from .seeds import (
     column_dataset,
@@ -55,13 +55,11 @@ class _Scene:
     noise: float
     blur_sigma_px: float
 
-    @property
-    def blurred(self) -> NDArray[np.float32]:
-        return blur(self.image, self.blur_sigma_px)
+    def lattice(self, spacing_px: float | None = None) -> Lattice | None:
+        return find_lattice(self.image, self.valid, self.noise, self.blur_sigma_px, spacing_px)
 
-    @property
-    def blurred_noise(self) -> float:
-        return self.noise * damping(self.blur_sigma_px)
+    def relief(self, spacing: float, precision_px: float = np.inf) -> Relief:
+        return relief(self.image, self.valid, self.noise, spacing, self.blur_sigma_px, precision_px)
 
 
 @dataclass(frozen=True)
@@ -127,8 +125,7 @@ def find_columns(
     window = check_window(window_px or default_window(spacing), scene.image.shape, reason)
     search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
     centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
-    raised, _ = relief(scene.image, spacing, blur_sigma_px)
-    places = centroids(raised, climb(raised, found.places, search), centroid)
+    places = _refined(scene.relief(spacing, min(search / 6, centroid / 3)), found.places, search, centroid)
     inside, corner = _corners(places, window, scene.valid)
     places = np.where(inside[:, None], places, found.places)
     fit, status = _fit(scene, places, corner, inside, found.kind, window, max(search, 1.0))
@@ -153,15 +150,22 @@ def find_columns(
 
 
 def _scene(summed: xr.Dataset, settings: ColumnSettings, blur_sigma_px: float) -> _Scene:
-    counts = summed["image"].to_numpy().astype(np.float64)
+    counts = summed["image"].to_numpy().astype(np.float64, copy=False)
     valid = np.isfinite(counts) & (summed["exposure"].to_numpy() > 0)
     if not valid.any():
         raise InputError(
             "the summed image is empty", "columns", "exposed pixels", "none", "Check the drift: it may leave no overlap"
         )
-    counts[~valid] = np.median(counts[valid])
-    sign = 1 if settings.contrast == "bright" else -1
-    return _Scene(counts, sign * counts, valid, sign, pixel_noise(counts, valid), blur_sigma_px)
+    if not valid.all():
+        counts = np.where(valid, counts, np.median(sample(counts[valid])))
+    image, sign = (counts, 1) if settings.contrast == "bright" else (-counts, -1)
+    return _Scene(counts, image, valid, sign, pixel_noise(counts, valid), blur_sigma_px)
+
+
+def _refined(raised: Relief, places: Places, search: float, centroid: float) -> Places:
+    """Return places moved to the local maximum within ``search`` px, then to the centroid around it."""
+    climbed = climb(raised.height, raised.bins(places), search / raised.step)
+    return raised.px(centroids(raised.height, climbed, centroid / raised.step))
 
 
 def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) -> tuple[_Seeds, float]:
@@ -191,10 +195,9 @@ def _automatic(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
     if settings.spacing_px is None:
         lattice: Lattice | None = _lattice_of(scene, settings)
     else:
-        lattice = find_lattice(scene.blurred, scene.valid, scene.blurred_noise, settings.spacing_px)
+        lattice = scene.lattice(settings.spacing_px)
     spacing = lattice.spacing if lattice else float(settings.spacing_px or 0)
-    raised, share = relief(scene.image, spacing, scene.blur_sigma_px)
-    places = find_peaks(raised, scene.valid, lattice, spacing, share * scene.noise, settings.min_amplitude)
+    places = find_peaks(scene.relief(spacing), lattice, spacing, settings.min_amplitude)
     if not len(places):
         raise InputError(
             "no column stands out of the noise",
@@ -208,7 +211,7 @@ def _automatic(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
 
 
 def _lattice_of(scene: _Scene, settings: ColumnSettings) -> Lattice:
-    lattice = find_lattice(scene.blurred, scene.valid, scene.blurred_noise)
+    lattice = scene.lattice()
     if lattice is None:
         raise InputError(
             "the summed image shows no lattice, so the distance between columns is not known",
@@ -296,17 +299,17 @@ def _fit(
     x, y = corner[inside].T
     windows = cut_windows(scene.counts[None], y[None], x[None], window, scene.blur_sigma_px)[0]
     start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
-    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200}
+    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200, "radius_px": window / 2}
     fits = fit_gaussians(windows, start, lower, upper, **options)
     odd = _odd_shapes(fits, kind[inside], start, lower, upper)
     if odd.any():
         again = fit_gaussians(windows[odd], start[odd], lower[odd], upper[odd], **options)
-        for name in ("estimates", "converged", "at_bound"):
+        for name in ("estimates", "status"):
             getattr(fits, name)[odd] = getattr(again, name)
     fit[inside] = fits.estimates
     fit[inside, X] += x
     fit[inside, Y] += y
-    weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.blurred_noise)
+    weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.noise * damping(scene.blur_sigma_px))
     flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: ~fits.converged, Status.AT_BOUND: fits.at_bound}
     for flag, found in flags.items():
         status[inside] |= np.where(found, flag, Status.OK).astype(np.uint8)

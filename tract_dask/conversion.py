@@ -6,11 +6,14 @@ On disk: a Zarr v3 group that is an OME-Zarr 0.5 image. Array ``0`` holds the fr
 
 from __future__ import annotations
 
+import math
 import time
-import uuid
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +26,21 @@ from zarr.codecs import BloscCodec
 from . import schema, stores
 from .errors import DestinationError, SourceError
 from .io import FrameSource, SourceMetadata, open_cached, open_source
-from .kernels.binning import measure_frame
-from .layout import LEVEL_DTYPE, Grid, Layout, disk_bytes, plan_layout
+from .kernels.binning import FrameMeter
+from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
 from .ome import AXES, describe
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import fingerprint, provenance, stage_key
 from .settings import ConvertSettings, MetadataSettings, SourceSettings
-from .shards import Journal, Payload, Shard, journal_beside, run_shards, split
+from .shard_files import BLOSC, Grid, ShardWriter, shard_path
+from .shards import Journal, Payload, Shard, journal_beside, split, stream_shards
 
 _DEFAULT_LAYOUT = ConvertSettings()
 
 STAGE = "convert"
 _AS_THE_FILE_SAYS = MetadataSettings()
 _DECLARED_NOTHING = SourceSettings()
-_COMPRESSORS = {
-    "lz4": BloscCodec(cname="lz4", clevel=5, shuffle="bitshuffle"),
-    "zstd": BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle"),
-    "none": None,
-}
+_AHEAD_BYTES = 32 << 20
 
 
 def convert(
@@ -112,17 +112,23 @@ def convert(
             about = provenance(key, settings, movie.path) | {"format": movie.format}
             _create(path, layout, settings.codec, about, known)
         journal = Journal(journal_beside(path), key)
-    done_frames = sum(shards[index].frames for index in journal.done())
-    on_event(announce(done_frames=done_frames))
-    payloads = run_shards(
+    on_event(announce(done_frames=journal.frames_done(shards)))
+    statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
+
+    def keep(shard: Shard, payload: Payload) -> None:
+        for name, values in statistics.items():
+            values[shard.start : shard.stop] = payload[name]
+
+    stream_shards(
         partial(_convert_shard, _Job(_absolute(movie.path), source_settings, path, layout, settings.codec)),
         shards,
+        keep,
         journal=journal,
         name=STAGE,
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone(STAGE, shard.index, shard.frames)),
     )
-    _finalise(path, payloads, known)
+    _finalise(path, statistics, known)
     journal.remove()
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
     return path
@@ -165,51 +171,54 @@ class _Job:
 def _convert_shard(job: _Job, shard: Shard) -> Payload:
     """Read the frames of a shard, measure and bin them, write them; return their statistics."""
     source = open_cached(job.source, job.source_settings)
-    block = np.ascontiguousarray(source.read(shard.start, shard.stop), dtype=job.layout.dtype)
-    expected = (shard.frames, *job.layout.shape[1:])
-    if block.shape != expected:
+    found, expected = (f"shape {it.shape}, {it.dtype}" for it in (source, job.layout))
+    if found != expected:
         raise SourceError(
-            f"frames {shard.start} to {shard.stop - 1} are not what they were when the conversion began",
+            "the movie is not what it was when the conversion began",
             job.source,
-            f"shape {expected}",
-            f"shape {block.shape}",
+            expected,
+            found,
             "Do not change the file meanwhile; convert it again",
         )
-    levels = [np.empty((shard.frames, *job.layout.grid(factor).shape[1:]), LEVEL_DTYPE) for factor in job.layout.bins]
+    meter = FrameMeter(job.layout.shape[1:], job.layout.dtype, len(job.layout.bins))
     statistics: dict[str, list[float]] = {name: [] for name in schema.STATISTICS}
-    for number, frame in enumerate(block):
-        *measures, means = measure_frame(frame, len(levels))
-        for level, mean in zip(levels, means, strict=True):
-            level[number] = mean
-        for values, measure in zip(statistics.values(), measures, strict=True):
-            values.append(measure)
-    _write_shard(job, "0", job.layout.grid(), shard.index, block)
-    del block
-    for factor, level in zip(job.layout.bins, levels, strict=True):
-        _write_shard(job, f"binned/{factor}", job.layout.grid(factor), shard.index, level)
+    with stores.disk_errors(job.path), ExitStack() as stack:
+        writers = [stack.enter_context(_writer(job, factor, shard.index)) for factor in (1, *job.layout.bins)]
+        for frame in _read_ahead(source, shard, job.layout.chunk[0]):
+            *measures, levels = meter.measure(frame)
+            for writer, pixels in zip(writers, (frame, *levels), strict=True):
+                writer.add(pixels)
+            for values, measure in zip(statistics.values(), measures, strict=True):
+                values.append(measure)
     return statistics
 
 
-def _write_shard(job: _Job, name: str, grid: Grid, index: int, block: NDArray[Any]) -> None:
-    """Write one whole shard of an array: aside first, then renamed to its place.
+def _read_ahead(source: FrameSource, shard: Shard, depth: int) -> Iterator[NDArray[Any]]:
+    """Yield the frames of a shard, while a thread reads those that follow; a frame is valid until the next."""
+    step = 1 if source.one_by_one else depth
+    starts = range(shard.start, shard.stop, step)
+    frame_bytes = math.prod(source.shape[1:]) * source.dtype.itemsize
+    n_blocks = min(len(starts), max(2, _AHEAD_BYTES // (step * frame_bytes)))
+    blocks = [np.empty((step, *source.shape[1:]), source.dtype) for _ in range(n_blocks)]
 
-    Aside it is the only shard of an array of its own, so that neither a killed task nor a second copy of this one can
-    leave a shard that is half written.
-    """
-    aside = journal_beside(job.path) / f"{uuid.uuid4().hex}.partial"
-    place = job.path / name / "c" / str(index) / "0" / "0"
-    try:
-        with stores.disk_errors(place), stores.codec_pipeline():
-            array = _create_array(aside, grid._replace(shape=grid.shard), block.dtype, job.codec)
-            array[...] = _padded(block, grid.shard)
-            written = aside / "c" / "0" / "0" / "0"
-            if written.exists():
-                place.parent.mkdir(parents=True, exist_ok=True)
-                written.replace(place)
-            else:  # nothing but zeros is not stored
-                stores.remove(place)
-    finally:
-        stores.remove(aside)
+    def read(number: int) -> NDArray[Any]:
+        block = blocks[number % n_blocks][: shard.stop - starts[number]]
+        source.read_into(starts[number], block)
+        return block
+
+    with ThreadPoolExecutor(1, "read-ahead") as reader:
+        ahead = deque(reader.submit(read, number) for number in range(n_blocks))
+        for following in range(n_blocks, len(starts) + n_blocks):
+            yield from ahead.popleft().result()
+            if following < len(starts):
+                ahead.append(reader.submit(read, following))
+
+
+def _writer(job: _Job, factor: int, index: int) -> ShardWriter:
+    """Return the writer of a shard of the frames (``factor`` 1) or of a binned level."""
+    array = job.path / ("0" if factor == 1 else f"binned/{factor}")
+    dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
+    return ShardWriter(shard_path(array, index), journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
 
 
 def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
@@ -244,7 +253,7 @@ def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> z
         chunks=grid.chunk,
         shards=grid.shard,
         dtype=dtype,
-        compressors=_COMPRESSORS[codec],
+        compressors=BloscCodec(**BLOSC[codec]) if codec in BLOSC else None,
         fill_value=0,
         dimension_names=AXES,
         zarr_format=3,
@@ -264,12 +273,11 @@ def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: d
     )
 
 
-def _finalise(path: Path, payloads: dict[int, Payload], known: SourceMetadata) -> None:
-    """Write the statistics and the metadata, and say that the store is complete."""
+def _finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: SourceMetadata) -> None:
+    """Write the statistics (frames,) and the metadata, and say that the store is complete."""
     with stores.disk_errors(path):
-        for name in schema.STATISTICS:
-            values = chain.from_iterable(payloads[index][name] for index in sorted(payloads))
-            zarr.open_array(str(path / name), mode="r+")[...] = np.array(list(values))
+        for name, values in statistics.items():
+            zarr.open_array(str(path / name), mode="r+")[...] = values
         describe(path, stores.attributes(path) | _quantities(known) | {"complete": True})
 
 
@@ -338,12 +346,3 @@ def _absolute(source: str) -> str:
     """Return the source's path as any worker can use it, whatever folder it runs in."""
     outer, inside, inner = source.partition("::")
     return f"{Path(outer).absolute()}{inside}{inner}"
-
-
-def _padded(block: NDArray[Any], shape: tuple[int, int, int]) -> NDArray[Any]:
-    """Return ``block`` filled up with zeros to ``shape``; itself where nothing is missing."""
-    if block.shape == shape:
-        return block
-    padded = np.zeros(shape, block.dtype)
-    padded[tuple(slice(length) for length in block.shape)] = block
-    return padded

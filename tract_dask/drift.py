@@ -2,20 +2,21 @@
 
 A frame's drift says where its content lies against the summed image: raw position = summed position + drift.
 
-Drift is measured on a level of about a million pixels a frame, in three runs over the movie, each a task a shard.
-The first run follows the movie: a frame is searched for near the one before it, against the sum of those before, and
-the shards' means are then chained in the same way. No step may exceed the search range, 0.4 of the lattice period
-unless the user says otherwise, so one lattice vector more or less is never an answer. The second and third run fit
-every frame to the mean of all others, to sub-pixel.
+Drift is measured on a level of about a million pixels a frame, in two runs over the movie, each a task a shard. The
+first run follows the movie: a frame is searched for near the one before it, against the sum of those before, and the
+shards' sums are then chained in the same way. No step may exceed the search range, 0.4 of the lattice period unless
+the user says otherwise, so one lattice vector more or less is never an answer. The second run fits every frame to the
+mean of all other shards, to sub-pixel.
 """
 
 from __future__ import annotations
 
 import csv
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -27,26 +28,25 @@ from numpy.typing import NDArray
 
 from . import schema
 from .errors import SettingsError, SourceError
+from .kernels.alignment import Template, align
 from .kernels.registration import (
+    Floats,
     Image,
-    LowPass,
     Spectrum,
-    add_shifted,
-    align,
+    clean_image,
     correlation,
     fold_image,
     measure_spectrum,
-    moments,
     search,
 )
+from .kernels.sums import Whole, add_shifted
 from .movie import Movie
 from .passes import Passes, save_array
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
-from .shards import Payload, Shard
+from .shards import Payload, Shard, Shards, split
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LEVEL_PIXELS = 1 << 20
@@ -61,10 +61,14 @@ SMALLEST_SIDE = 64
 SEARCH_SHARE = 0.4
 """Search range as a share of the lattice period: two answers within it are never a period apart."""
 
-PASSES = ("follow", "refine-1", "refine-2")
+SEARCH_LOSS = 0.75
+"""For the search it is binned by 2 and 2 again as long as that loses less than this share of the information."""
 
-_BLOCK_BYTES = 64 << 20
-_SAMPLES, _SAMPLE_FRAMES = 4, 4
+PASSES = ("follow", "refine")
+
+_BLOCK_BYTES = 16 << 20
+_SAMPLES, _SAMPLE_FRAMES = 4, 2
+_FEWEST_PARTS, _PART_FRAMES = 8, 64
 _TRUST = 0.5
 _MEMORY = 16
 
@@ -79,9 +83,9 @@ def estimate_drift(
 ) -> xr.Dataset:
     """Return the drift of every frame, (frame, axis) in px, zero at its median, and a quality for each frame.
 
-    Quality is Pearson's correlation of the filtered frame with the filtered mean of all others, cut to 0..1; it falls
-    with the dose. It is 0 where a frame holds nothing to register (all NaN, or constant); the drift of such a frame
-    is interpolated. For methods csv and none it is 1.
+    Quality is Pearson's correlation of the filtered frame with the filtered mean of all other parts of the movie, cut
+    to 0..1; it falls with the dose. It is 0 where a frame holds nothing to register (all NaN, or constant); the drift
+    of such a frame is interpolated. For methods csv and none it is 1.
 
     Parameters
     ----------
@@ -90,7 +94,7 @@ def estimate_drift(
         one stopped. Delete it once the result is stored. It must be seen by every worker; None takes a folder for
         temporary files.
     on_event
-        Told of ``drift``; for method auto every frame counts three times, once for each run over the movie.
+        Told of ``drift``; for method auto every frame counts twice, once for each run over the movie.
 
     Returns
     -------
@@ -200,6 +204,8 @@ class Level:
         Of the movie's frames on this level.
     search
         Search range, px of the level.
+    search_fold
+        Further binning for the search.
     """
 
     stored: int
@@ -207,33 +213,30 @@ class Level:
     shape: tuple[int, int]
     spectrum: Spectrum
     search: float
+    search_fold: int
 
     @property
     def bin(self) -> int:
         """Pixels of the movie along one side of a pixel of the level."""
         return self.stored * self.fold
 
-    def low_pass(self, n_frames: float) -> LowPass:
-        """Return the filter for a mean of ``n_frames`` frames."""
-        return LowPass(self.shape, self.spectrum.frequency, self.spectrum.gain(n_frames))
-
 
 @dataclass
 class Track:
-    """What is known of every frame between two runs; px of the level.
+    """What is known of every frame between the two runs; px of the level.
 
     Attributes
     ----------
     drift
         (frames, 2).
     placed
-        (frames, 2) whole pixels by which the frame was moved into the present sum.
+        (frames, 2) whole pixels by which the frame was moved into the sum.
     trusted
         (frames,) whether it is part of that sum.
     """
 
     drift: Floats
-    placed: NDArray[np.int64]
+    placed: Whole
     trusted: Bools
 
     def save(self, path: Path) -> None:
@@ -251,25 +254,20 @@ def _measure_drift(
     movie: Movie, settings: DriftSettings, client: Client | None, on_event: Sink, folder: Path | None
 ) -> xr.Dataset:
     level = _choose_level(movie, settings)
+    shards = _parts(movie)
     with Passes("drift", movie, on_event, folder, client, len(PASSES)) as stage:
         key = stage_key(movie.key, f"drift {settings.search_px!r}")
-        journals = [stage.journal(name, f"{name} {key}") for name in PASSES]
-        stage.begin([(journal, movie.shards) for journal in journals])
-        follow = journals[0]
-        payloads = stage.run(partial(_follow_shard, movie, level, follow.path), movie.shards, follow)
-        track, template = _chain(level, movie.shards, payloads, follow.path)
-        quality = np.zeros(movie.n_frames)
-        for journal in journals[1:]:
-            save_array(journal.path / "template.npy", template)
-            track.save(journal.path / "track.npy")
-            payloads = stage.run(partial(_refine_shard, movie, level, journal.path), movie.shards, journal)
-            found = np.concatenate([np.array(payloads[shard.index]["drift"]) for shard in movie.shards])
-            quality = np.concatenate([np.array(payloads[shard.index]["quality"]) for shard in movie.shards])
-            template = np.zeros_like(template)
-            for shard in movie.shards:
-                template += np.load(journal.path / f"{shard.index}.npy")
-            track = Track(found, np.rint(found).astype(np.int64), track.trusted)
-        drift = _fill(track.drift, quality > 0.0)
+        follow, refine = (stage.journal(name, f"{name} {key}") for name in PASSES)
+        stage.begin([(follow, shards), (refine, shards)])
+        payloads = stage.run(partial(_follow_shard, movie, level, follow.path), shards, follow)
+        track, places = _chain(level, shards, payloads, follow.path)
+        save_array(refine.path / "sum.npy", _add_up(level, places, follow.path))
+        save_array(refine.path / "places.npy", places)
+        track.save(refine.path / "track.npy")
+        payloads = stage.run(partial(_refine_shard, movie, level, follow.path, refine.path), shards, refine)
+        found = np.concatenate([np.array(payloads[shard.index]["drift"]) for shard in shards])
+        quality = np.concatenate([np.array(payloads[shard.index]["quality"]) for shard in shards])
+        drift = _fill(_on_one_scale(found, track, shards), quality > 0.0)
         if not (quality > 0.0).any():
             on_event(Warned("no frame shows a structure to measure drift by; drift is taken as zero"))
         drift = level.bin * (drift - np.median(drift, axis=0))
@@ -283,6 +281,16 @@ def _measure_drift(
         search_px=level.search * level.bin,
         period_px=level.spectrum.period_px * level.bin if np.isfinite(level.spectrum.period_px) else None,
     )
+
+
+def _parts(movie: Movie) -> Shards:
+    """Return the parts of the movie that are worked on at a time: whole shards, or less where an eighth of it is less.
+
+    Each part is compared with the mean of all others: it must be a small part of the movie, but a task spends some time
+    on that mean, whatever the number of its frames.
+    """
+    per_shard, eighth = movie.shards[0].frames, -(-movie.n_frames // _FEWEST_PARTS)
+    return split(movie.n_frames, max(min(per_shard, eighth), min(_PART_FRAMES, eighth) // per_shard * per_shard))
 
 
 def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
@@ -299,7 +307,10 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     shape = (ny // stored // fold, nx // stored // fold)
     period = spectrum.period_px if np.isfinite(spectrum.period_px) else min(shape) / (8 * SEARCH_SHARE)
     reach = settings.search_px / (stored * fold) if settings.search_px is not None else SEARCH_SHARE * period
-    return Level(stored, fold, shape, spectrum, max(1.0, reach))
+    search_fold = 1
+    while spectrum.loss(2 * search_fold) < SEARCH_LOSS and min(shape) // search_fold >= 2 * SMALLEST_SIDE:
+        search_fold *= 2
+    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold)
 
 
 def _samples(movie: Movie, stored: int) -> list[Image]:
@@ -328,151 +339,159 @@ def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
         stop = min(start + step, shard.stop)
         block = movie.read(start, stop) if stored == 1 else movie.read_binned(stored, start, stop)
         for raw in block[:, :ny, :nx]:  # without bins that hang over the edge
-            image = raw.astype(np.float32)
-            if raw.dtype.kind == "f" and not (finite := np.isfinite(image)).all():
-                image[~finite] = image[finite].mean(dtype=np.float64) if finite.any() else 0.0
-            yield image if image.min() < image.max() else None
+            image, shows_anything = clean_image(raw)
+            yield image if shows_anything else None
 
 
-class _Reference:
-    """The running sum of images that move: keeps itself where the newest is, and its filtered form up to date."""
+# --- the first run: following the movie ------------------------------------------------------------------------------
+
+
+class _MovingSum:
+    """A sum of images that move: it keeps itself where the newest is."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.total, self.origin = np.zeros(shape, np.float32), np.zeros(2, np.int64)
+
+    def add(self, image: Image, place: Whole) -> None:
+        """Add an image that lies at ``place``; move along where that is far from the origin."""
+        if (np.abs(place - self.origin) > np.array(self.total.shape[-2:]) / 8).any():
+            moved = np.zeros_like(self.total)
+            add_shifted(moved, self.total, self.origin - place)
+            self.total, self.origin = moved, place
+        add_shifted(self.total, image, place - self.origin)
+
+
+class _Follower:
+    """Follows images, binned for the search, each against the sum of those before; shifts in px of the level."""
 
     def __init__(self, level: Level) -> None:
-        self.level = level
-        self.total, self.exposure = np.zeros(level.shape, np.float32), np.zeros(level.shape, np.float32)
-        self.origin = np.zeros(2)
-        self._template, self._count = np.zeros(level.shape, np.float32), 0.0
+        self.fold, self.reach = level.search_fold, level.search / level.search_fold
+        self.sum = _MovingSum((level.shape[0] // self.fold, level.shape[1] // self.fold))
+        self.empty = True
+        self._recent: deque[float] = deque(maxlen=_MEMORY)
 
-    @property
-    def empty(self) -> bool:
-        return not self.exposure.any()
+    def follow(self, small: Image, guess: Floats) -> tuple[Floats, float]:
+        """Return the shift of an image near a guess, and its score; take it up unless it looks like no other."""
+        shift, score = guess / self.fold, 1.0
+        if not self.empty:
+            dy, dx, score = search(small, self.sum.total, tuple(shift - self.sum.origin), self.reach)
+            shift = np.array([dy, dx]) + self.sum.origin
+            if self._recent and score < _TRUST * np.median(self._recent):
+                return guess, score
+            self._recent.append(score)
+        self.sum.add(small, _whole(shift))
+        self.empty = False
+        return shift * self.fold, score
 
-    def find(self, image: Image, guess: Floats) -> tuple[Floats, float]:
-        """Return the shift of an image near a guess, and its score."""
-        template, origin = self.template(), self.origin
-        dy, dx, score = search(image, template, tuple(guess - origin), self.level.search)
-        return np.array([dy, dx]) + origin, score
-
-    def template(self) -> Image:
-        """Return the filtered mean; it is made anew whenever the sum has grown by a quarter."""
-        count = float(self.exposure.max())
-        if count >= 1.25 * self._count:
-            self._template, self._count = self.level.low_pass(count)(self.total) / np.float32(count), count
-        return self._template
-
-    def add(self, total: Image, exposure: Image, shift: Floats) -> None:
-        """Add an image, or a sum of images, that lies at ``shift``; move along where it is far from the origin."""
-        away = np.rint(shift) - self.origin
-        if (np.abs(away) > np.array(self.level.shape) / 8).any():
-            for name in ("total", "exposure"):
-                moved = np.zeros(self.level.shape, np.float32)
-                add_shifted(moved, getattr(self, name), _whole(-away))
-                setattr(self, name, moved)
-            self.origin, self._count, away = self.origin + away, 0.0, np.zeros(2)
-        add_shifted(self.total, total, _whole(away))
-        add_shifted(self.exposure, exposure, _whole(away))
+    def resemblance(self, small: Image, shift: Floats) -> float:
+        """Return Pearson's correlation of an image that lies at ``shift`` with the sum."""
+        return correlation(small, self.sum.total, _whole(shift / self.fold) - self.sum.origin)
 
 
 def _follow_shard(movie: Movie, level: Level, folder: Path, shard: Shard) -> Payload:
-    """Follow the drift through a shard; leave the sum of its frames, aligned to whole pixels, in ``folder``."""
-    reference, ones = _Reference(level), np.ones(level.shape, np.float32)
-    shifts, guess = np.full((shard.frames, 2), np.nan), np.zeros(2)
-    recent: deque[float] = deque(maxlen=_MEMORY)
-    for k, image in enumerate(_frames(movie, level, shard)):
-        if image is None:
+    """Follow the drift through a shard; leave the sum of its frames, moved by whole pixels, in ``folder``.
+
+    Frames with less than half the usual score are not part of it. The first ones are judged again, by all of them
+    together, before any is added: the very first had nothing to be compared with.
+    """
+    follower, added = _Follower(level), _MovingSum((2, *level.shape))
+    shifts, scores, guess = np.zeros((shard.frames, 2)), np.full(shard.frames, np.nan), np.zeros(2)
+    trusted = np.zeros(shard.frames, np.bool_)
+    images = _frames(movie, level, shard)
+    pairs = ((image, None if image is None else fold_image(image, level.search_fold)) for image in images)
+    opening = list(islice(pairs, _MEMORY))
+    for k, (_, small) in enumerate(opening):
+        if small is not None:
+            shifts[k], _ = guess, _ = follower.follow(small, guess)
+    for k, (_, small) in enumerate(opening):
+        if small is not None:
+            scores[k] = follower.resemblance(small, shifts[k])
+    counted = np.ones((2, *level.shape), np.float32)
+    for k, (image, small) in enumerate(chain(opening, pairs)):
+        if image is None or small is None:
             continue
-        shifts[k] = guess
-        if not reference.empty:
-            shifts[k], score = reference.find(image, guess)
-            if recent and score < _TRUST * np.median(recent):
-                continue
-            recent.append(score)
-        reference.add(image, ones, shifts[k])
-        guess = shifts[k]
-    shifts -= reference.origin
-    trusted = _trusted(movie, level, shard, reference, shifts)
-    save_array(folder / f"{shard.index}.npy", np.stack([reference.total, reference.exposure]))
-    return {"drift": shifts.tolist(), "trusted": trusted.tolist()}
+        if k >= len(opening):
+            shifts[k], scores[k] = guess, _ = follower.follow(small, guess)
+        trusted[k] = scores[k] >= _TRUST * np.nanmedian(scores[: max(k + 1, len(opening))])
+        if trusted[k]:
+            counted[0] = image
+            added.add(counted, _whole(shifts[k]))
+    save_array(folder / f"{shard.index}.npy", added.total)
+    placed = _whole(shifts) - added.origin
+    return {"drift": shifts - added.origin, "placed": placed, "trusted": trusted}
 
 
-def _trusted(movie: Movie, level: Level, shard: Shard, reference: _Reference, shifts: Floats) -> Bools:
-    """Tell which frames of a shard resemble its mean: at least half as much as their median does."""
-    if reference.empty:
-        return np.zeros(shard.frames, np.bool_)
-    template = reference.template()
-    weight = (reference.exposure > 0.5 * reference.exposure.max()).astype(np.float32)
-    scores = np.array(
-        [
-            np.nan if image is None else correlation(moments(image, template, weight, dy, dx))
-            for image, (dy, dx) in zip(_frames(movie, level, shard), shifts, strict=True)
-        ]
-    )
-    return np.asarray(scores >= _TRUST * np.nanmedian(scores))
+def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], folder: Path) -> tuple[Track, Whole]:
+    """Join the shards: the sum of each is searched for where the shard before it ended.
 
-
-def _chain(
-    level: Level, shards: tuple[Shard, ...], payloads: dict[int, Payload], folder: Path
-) -> tuple[Track, NDArray[np.float32]]:
-    """Join the shards: each mean is searched for where the shard before it ended. Return the track and the sum."""
+    Returns the track, and by how many pixels the sum of each shard is moved into that of all, (shards, 2).
+    """
     n_frames = shards[-1].stop
-    track = Track(np.full((n_frames, 2), np.nan), np.zeros((n_frames, 2), np.int64), np.zeros(n_frames, np.bool_))
-    offsets: dict[Shard, Floats] = {}
-    reference, last = _Reference(level), np.zeros(2)
+    track = Track(np.zeros((n_frames, 2)), np.zeros((n_frames, 2), np.int64), np.zeros(n_frames, np.bool_))
+    offsets, follower, last = np.zeros((len(shards), 2)), _Follower(level), np.zeros(2)
     for shard in shards:
-        shifts, trusted = np.array(payloads[shard.index]["drift"]), np.array(payloads[shard.index]["trusted"])
+        drift, placed, trusted = (np.array(payloads[shard.index][name]) for name in ("drift", "placed", "trusted"))
         if not trusted.any():
             continue
-        total, exposure = np.load(folder / f"{shard.index}.npy")
-        first, final = np.flatnonzero(trusted)[[0, -1]]
-        offset = np.zeros(2)
-        if offsets:
-            offset, _ = reference.find(total / max(1.0, float(exposure.max())), last - shifts[first])
-        reference.add(total, exposure, offset)
-        offsets[shard], last = offset, offset + shifts[final]
         here = slice(shard.start, shard.stop)
-        track.drift[here], track.trusted[here] = shifts + offset, trusted
-        track.placed[here][trusted] = np.rint(shifts[trusted])
+        first, final = np.flatnonzero(trusted)[[0, -1]]
+        total, exposure = np.load(folder / f"{shard.index}.npy")
+        guess = last - drift[first] if track.trusted.any() else np.zeros(2)
+        small = fold_image(total / np.float32(max(1.0, exposure.max())), level.search_fold)
+        offset, _ = follower.follow(small, guess)
+        offsets[shard.index], last = offset, offset + drift[final]
+        track.drift[here], track.placed[here], track.trusted[here] = drift + offset, placed, trusted
     track.drift = _fill(track.drift, track.trusted)
     zero = np.rint(np.median(track.drift, axis=0))
     track.drift -= zero
-    template = np.zeros((2, *level.shape), np.float32)
-    for shard, offset in offsets.items():
-        place = np.rint(offset - zero)
-        track.placed[shard.start : shard.stop] += place.astype(np.int64)
-        for target, part in zip(template, np.load(folder / f"{shard.index}.npy"), strict=True):
-            add_shifted(target, part, _whole(place))
-    return track, template
+    places = _whole(offsets - zero)
+    track.placed += np.repeat(places, [shard.frames for shard in shards], axis=0)
+    return track, places
 
 
-def _refine_shard(movie: Movie, level: Level, folder: Path, shard: Shard) -> Payload:
-    """Fit each frame of a shard to the mean of all other frames; leave the sum of its frames at their new places."""
+def _add_up(level: Level, places: Whole, folder: Path) -> Image:
+    """Return the sum of all shards and how many frames cover each of its pixels, (2, y, x)."""
+    total = np.zeros((2, *level.shape), np.float32)
+    for index, place in enumerate(places):
+        add_shifted(total, np.load(folder / f"{index}.npy"), place)
+    return total
+
+
+# --- the second run: each frame against the mean of all other shards --------------------------------------------------
+
+
+def _refine_shard(movie: Movie, level: Level, follow: Path, folder: Path, shard: Shard) -> Payload:
+    """Fit each frame of a shard to the mean of all other shards."""
     track = Track.load(folder / "track.npy", shard)
-    total, exposure = np.load(folder / "template.npy")
-    count = float(exposure.max())
-    low_pass = level.low_pass(max(1.0, count - 1.0))
-    total, exposure, one = low_pass(total), low_pass(exposure), low_pass(np.ones(level.shape, np.float32))
+    template = _mean_of_others(level, follow, folder, shard)
     drift, quality = track.drift.copy(), np.zeros(shard.frames)
-    sums = np.zeros((2, *level.shape), np.float32)
-    ones = np.ones(level.shape, np.float32)
     for k, image in enumerate(_frames(movie, level, shard)):
-        if image is None:
-            continue
-        smooth = low_pass(image)
-        others, seen, n = total, exposure, max(count, 1.0)
-        if track.trusted[k] and count > 1.0:
-            others, seen, n = total.copy(), exposure.copy(), count - 1.0
-            add_shifted(others, -smooth, _whole(track.placed[k]))
-            add_shifted(seen, -one, _whole(track.placed[k]))
-        weight = (seen > 0.5 * n).astype(np.float32)
-        template: Image = np.divide(others * weight, np.maximum(seen, 0.5 * n), dtype=np.float32)
-        fit = align(image, template, weight, tuple(track.drift[k]), limit=level.search / 2)
-        drift[k] = fit.dy, fit.dx
-        quality[k] = np.clip(correlation(moments(smooth, template, weight, fit.dy, fit.dx)), 0.0, 1.0)
-        if track.trusted[k]:
-            add_shifted(sums[0], image, _whole(drift[k]))
-            add_shifted(sums[1], ones, _whole(drift[k]))
-    save_array(folder / f"{shard.index}.npy", sums)
-    return {"drift": drift.tolist(), "quality": quality.tolist()}
+        if image is not None:
+            fit = align(image, template, tuple(track.drift[k]), limit=level.search / 2)
+            drift[k], quality[k] = (fit.dy, fit.dx), max(0.0, fit.correlation)
+    return {"drift": drift, "quality": quality}
+
+
+def _mean_of_others(level: Level, follow: Path, folder: Path, shard: Shard) -> Template:
+    """Return the mean of all shards but one; of all, where there is no other."""
+    every, place = np.load(folder / "sum.npy"), np.load(folder / "places.npy")[shard.index]
+    others = every.copy()
+    add_shifted(others, -np.load(follow / f"{shard.index}.npy"), place)
+    total, exposure = others if others[1].any() else every
+    return Template(total, exposure, level.spectrum.frequency, level.spectrum.gain(max(1.0, float(exposure.max()))))
+
+
+def _on_one_scale(found: Floats, track: Track, shards: Sequence[Shard]) -> Floats:
+    """Return the drift against the mean of all frames.
+
+    What is left of the drift after rounding, drift - placed, moves a mean of frames by its own mean. For the mean that
+    a shard was fitted to that is (its sum over all frames - its sum over the shard) / their number, to first order,
+    also where this very correction is counted in; the sum over all moves every frame alike.
+    """
+    left = (found - track.placed) * track.trusted[:, None]
+    own = np.add.reduceat(left, [shard.start for shard in shards])
+    own = np.repeat(own, [shard.frames for shard in shards], axis=0)
+    return found - own / max(1, int(track.trusted.sum()))
 
 
 def _fill(drift: Floats, good: Bools) -> Floats:
@@ -484,7 +503,6 @@ def _fill(drift: Floats, good: Bools) -> Floats:
     return np.where(good[:, None], drift, filled)
 
 
-def _whole(shift: NDArray[Any]) -> tuple[int, int]:
-    """Return a shift in whole pixels."""
-    dy, dx = np.rint(shift)
-    return int(dy), int(dx)
+def _whole(shift: Floats) -> Whole:
+    """Return shifts in whole pixels."""
+    return np.rint(shift).astype(np.int64)

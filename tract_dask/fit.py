@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from . import results, schema, stores
 from .errors import SettingsError
+from .kernels.gaussian import blurred
 from .measure import Floats, Job, measure
 from .movie import Movie, open_movie
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
 from .settings import FitSettings, from_toml
-from .shards import Journal, Payload, Shard, journal_beside, run_shards
+from .shards import Journal, Payload, Shard, journal_beside, stream_shards
 from .vacuum import check_box, find_vacuum
 from .windows import check_window, default_window, neighbour_distance
 
@@ -56,7 +57,7 @@ def fit_columns(
     drift
         From :func:`tract_dask.estimate_drift`; None means none.
     settings
-        Defaults to the paper's.
+        Defaults to least squares on blurred pixels, with every column's shape as in the summed image.
     summed
         From :func:`tract_dask.sum_image`; the vacuum for the noise is looked for in it. Without it, and without
         ``settings.vacuum_box``, the noise of a frame is the rms residual of its fits.
@@ -71,7 +72,7 @@ def fit_columns(
     Raises
     ------
     SettingsError
-        Where a window is larger than the frame, or the vacuum box leaves it.
+        Where a window is larger than the frame, the vacuum box leaves it, or counts (``poisson``) are negative.
     """
     job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed, refine_columns=refine_columns)
     n_columns = len(job.reference)
@@ -144,21 +145,27 @@ def fit_movie(
             **_calibration(movie),
             window=job.window,
             vacuum=job.vacuum,
+            reference_blur_px=columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px),
             refine_columns=job.refine_columns,
         )
     journal = Journal(journal_beside(path), key)
-    done = journal.done()
-    done_frames = sum(shard.frames for shard in movie.shards if shard.index in done)
+    done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
-    payloads = run_shards(
+    summary = dict.fromkeys(("fits", "accepted", "bad_frames"), 0)
+
+    def add(shard: Shard, payload: Payload) -> None:
+        for name in summary:
+            summary[name] += payload[name]
+
+    stream_shards(
         partial(_fit_task, movie.path, path, key),
         movie.shards,
+        add,
         journal=journal,
         name="fit",
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
     )
-    summary = {name: sum(int(p[name]) for p in payloads.values()) for name in ("fits", "accepted", "bad_frames")}
     stores.update_attributes(path, complete=True, summary=summary)
     journal.remove()
     on_event(
@@ -186,8 +193,32 @@ def prepare(
         check_box(box, movie.shape[1:], shift)
     elif summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
-    bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
-    return Job(_reference(columns), shift, bad, window, box, refine_columns if drift is not None else None, settings)
+    statistics = movie.statistics()
+    bad = statistics["frame_bad_pixels"].to_numpy() > 0
+    if settings.estimator == "poisson":
+        _check_counts(statistics["frame_min"].to_numpy())
+    blur = columns.attrs.get("blur_sigma_px", settings.blur_sigma_px)
+    refine = refine_columns if drift is not None else None
+    return Job(_reference(columns, blur, settings), shift, bad, window, box, refine, settings)
+
+
+def _check_counts(smallest: Floats) -> None:
+    """Check that the smallest pixels of the frames can be counts.
+
+    Raises
+    ------
+    SettingsError
+        Where one is negative.
+    """
+    if (smallest < 0).any():
+        frame = int(np.nanargmin(smallest))
+        raise SettingsError(
+            "a pixel is negative, so the frames are not counts",
+            "setting estimator (FitSettings)",
+            "counts, or a multiple of counts, for poisson",
+            f"{smallest[frame]:g} in frame {frame}",
+            "Choose the estimator lsq, or convert frames from which nothing was subtracted",
+        )
 
 
 def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
@@ -221,7 +252,7 @@ def frame_times(movie: Movie) -> Floats:
 def _fit_task(movie_path: Path, path: Path, key: str, shard: Shard) -> Payload:
     movie, job = _load(movie_path, path, key)
     values = measure(movie, shard, job)
-    results.write(path, shard, values)
+    results.write(path, shard, values, movie.shards[0].frames)
     fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
     return {
         "fits": int(fitted.sum()),
@@ -240,11 +271,15 @@ def _load(movie_path: Path, path: Path, key: str) -> tuple[Movie, Job]:
     vacuum = tuple(about["vacuum"]) if about["vacuum"] else None
     settings = from_toml(FitSettings, about["settings"], str(path))
     drift = store["drift_measured"].to_numpy()
-    return movie, Job(_reference(store), drift, bad, about["window"], vacuum, about["refine_columns"], settings)
+    reference = _reference(store, about["reference_blur_px"], settings)
+    return movie, Job(reference, drift, bad, about["window"], vacuum, about["refine_columns"], settings)
 
 
-def _reference(columns: xr.Dataset) -> Floats:
-    """Return the fit on the summed image; columns that have none get the median shape at their seed's place."""
+def _reference(columns: xr.Dataset, blur_sigma_px: float, settings: FitSettings) -> Floats:
+    """Return the fit on the summed image, which went through that blur, as it would be after that of the windows.
+
+    Columns that have none get the median shape at their seed's place.
+    """
     reference: Floats = columns["fit_ref"].to_numpy().astype(np.float64)
     known = np.isfinite(reference).all(axis=1)
     if not known.any():
@@ -258,7 +293,7 @@ def _reference(columns: xr.Dataset) -> Floats:
     reference[~known] = np.median(reference[known], axis=0)
     reference[:, X] = np.where(known, reference[:, X], columns["x_ref"].to_numpy())
     reference[:, Y] = np.where(known, reference[:, Y], columns["y_ref"].to_numpy())
-    return reference
+    return blurred(reference, settings.window_blur_px**2 - blur_sigma_px**2)
 
 
 def _calibration(movie: Movie) -> dict[str, float | None]:

@@ -33,6 +33,14 @@ _LARGE = 1500
 """Shorter side, in px, from twice which on the image is binned before it is correlated."""
 _NOISIEST = 3.0
 """Correlation without a shift, which noise lifts above 1, up to which a lattice can be found."""
+_PX_PER_SPACING = 24
+"""Pixels on which the distance between columns is seen: peaks are looked for in an image binned so far."""
+_MARGIN = 3
+"""The shortest shift, px, that may be a lattice vector."""
+_COARSE = 16
+"""Smoothing by so many px or more is done on bins of a sixteenth of it."""
+_SAMPLE = 1 << 20
+"""Of more values than these, statistics are taken from a sample."""
 _STRONG = 0.5
 _ALIKE = 0.7
 _SIGNIFICANT = 4.0
@@ -66,7 +74,37 @@ class Lattice:
         return np.asarray(np.array(steps, dtype=np.float64) @ np.array([self.a, self.b]))
 
 
-def find_lattice(image: Floats, valid: Mask, noise: float, spacing_px: float | None = None) -> Lattice | None:
+@dataclass(frozen=True)
+class Relief:
+    """An image in which columns stand out, of bins of ``step`` x ``step`` px; places are in px all the same.
+
+    Attributes
+    ----------
+    height
+        (y, x); columns bright, their surroundings about zero.
+    valid
+        (y, x) where the image has been exposed.
+    noise
+        Standard deviation of ``height`` where there is nothing.
+    """
+
+    height: Floats
+    valid: Mask
+    noise: float
+    step: int
+
+    def bins(self, places: Places) -> Places:
+        """Return places (x, y) in px as places in bins."""
+        return np.asarray((places + 0.5) / self.step - 0.5)
+
+    def px(self, places: Places) -> Places:
+        """Return places (x, y) in bins as places in px."""
+        return np.asarray((places + 0.5) * self.step - 0.5)
+
+
+def find_lattice(
+    image: Floats, valid: Mask, noise: float, blur_sigma_px: float, spacing_px: float | None = None
+) -> Lattice | None:
     """Return the lattice of an image from its autocorrelation, or None where it has none.
 
     Shifted by a lattice vector, an image correlates with itself almost as well as unshifted; shifted from one
@@ -78,14 +116,18 @@ def find_lattice(image: Floats, valid: Mask, noise: float, spacing_px: float | N
     Parameters
     ----------
     image, valid
-        (y, x); blurred, and where it has been exposed.
+        (y, x), and where it has been exposed.
     noise
-        Standard deviation of the image's noise.
+        Standard deviation of the noise of a pixel.
+    blur_sigma_px
+        Blur before the correlation.
     spacing_px
         Length of ``a``, where it is known: the best within a quarter of it is taken.
     """
     step = max(1, min(image.shape) // _LARGE)
-    heights, shifts = _autocorrelation(_binned(image, step), _binned(valid, step) == 1, noise)
+    blurred = blur(binned(image, step).astype(np.float32), blur_sigma_px / step)
+    noise *= damping(blur_sigma_px / step) / step
+    heights, shifts = _autocorrelation(blurred, binned(valid, step) == 1, noise)
     shifts = step * shifts
     length = np.hypot(shifts[:, 0], shifts[:, 1])
     least = _ORDERED
@@ -110,10 +152,36 @@ def _shortest(shifts: Places, heights: Floats, least: float) -> Places | None:
     return shifts[min(high, key=lambda n: float(shifts[n] @ shifts[n]))] if len(high) else None
 
 
-def _binned(image: Floats | Mask, step: int) -> Places:
+def binned(image: Floats | Mask, step: int) -> Places:
     """Return the means of blocks of ``step`` pixels, without the rest at the right and the bottom."""
-    ny, nx = (size // step * step for size in image.shape)
-    return np.asarray(image[:ny, :nx].reshape(ny // step, step, nx // step, step).mean(axis=(1, 3), dtype=np.float64))
+    ny, nx = (size // step for size in image.shape)
+    rows = image[: ny * step, : nx * step].reshape(ny, step, nx * step).mean(axis=1, dtype=np.float64)
+    return np.asarray(rows.reshape(ny, nx, step).mean(axis=2))
+
+
+def expanded(bins: Floats, shape: tuple[int, int], step: int, first: tuple[float, float]) -> Floats:
+    """Return ``bins`` on pixels, interpolated linearly; a product with two matrices of weights.
+
+    Parameters
+    ----------
+    shape
+        (y, x) of the result.
+    step
+        Pixels from one bin to the next.
+    first
+        Pixel (y, x) on which bin 0 lies. Beyond the bins their edge goes on.
+    """
+    bins = bins.astype(np.float32)
+    down, across = (
+        np.maximum(0.0, 1.0 - np.abs(np.clip((np.arange(n)[:, None] - start) / step, 0, m - 1) - np.arange(m)))
+        for n, m, start in zip(shape, bins.shape, first, strict=True)
+    )
+    return np.asarray(down.astype(np.float32) @ bins @ across.T.astype(np.float32))
+
+
+def sample(values: Floats) -> Floats:
+    """Return about a million of the values, evenly spaced, where there are more."""
+    return values[:: max(1, len(values) // _SAMPLE)]
 
 
 def _autocorrelation(image: Floats, valid: Mask, noise: float) -> tuple[Floats, Places]:
@@ -124,36 +192,42 @@ def _autocorrelation(image: Floats, valid: Mask, noise: float) -> tuple[Floats, 
     however much of the image is vacuum; and multiplied by the square root of the envelopes' overlap, so that a long
     shift must be better than a short one. None where the noise outweighs the columns.
     """
-    ny, nx = image.shape
-    wide = min(ny, nx) / 8
-    flat = np.where(valid, image - smooth(image, wide), 0.0)
-    flat = np.clip(flat, *np.percentile(flat[valid], [0.5, 99.5])) * valid
-    power = smooth(flat**2, wide) / np.maximum(smooth(valid.astype(np.float64), wide), 1e-3)
-    envelope = np.sqrt(np.maximum(power - noise**2, 0.0)) * valid
-    size = [fft.next_fast_len(n + n // 2, real=True) for n in (ny, nx)]
-    centre = (ny // 2, nx // 2)
-
-    def correlate(values: Floats) -> Floats:
-        """Up to shifts of half the image, the middle one zero."""
-        spectrum = np.abs(fft.rfft2(values.astype(np.float32), s=size)) ** 2
-        whole = np.roll(fft.irfft2(spectrum, s=size), centre, axis=(0, 1))
-        return np.asarray(whole[: 2 * centre[0] + 1, : 2 * centre[1] + 1], dtype=np.float64)
-
-    correlation, overlap = correlate(flat), correlate(envelope)
-    if not 0 < correlation[centre] < _NOISIEST * overlap[centre]:
+    wide = min(image.shape) / 8
+    flat = np.where(valid, image - smooth(image, wide), np.float32(0))
+    flat = np.clip(flat, *np.percentile(sample(flat[valid]), [0.5, 99.5]).astype(np.float32)) * valid
+    correlation = _correlate(flat)
+    step = _coarseness(wide)
+    share = binned(valid, step)
+    power = smooth(binned(flat**2, step), wide / step) / np.maximum(smooth(share, wide / step), 1e-3)
+    coarse = step**2 * _correlate(np.sqrt(np.maximum(power - noise**2, 0.0)) * share)
+    centre, middle = (_MARGIN, correlation.shape[1] // 2), (_MARGIN, coarse.shape[1] // 2)
+    overlap = expanded(coarse, correlation.shape, step, (centre[0] - step * middle[0], centre[1] - step * middle[1]))
+    level = overlap[centre]
+    if not 0 < correlation[centre] < _NOISIEST * level:
         return np.empty(0), np.empty((0, 2))
-    correlation, overlap = correlation / overlap[centre], overlap / overlap[centre]
-    enough = overlap >= _OVERLAP
-    correlation = np.where(enough, correlation / np.sqrt(np.where(enough, overlap, 1.0)), 0.0)
-    places = local_maxima(correlation, 3.0, _ORDERED / 4)
-    places = places[((places > 0) & (places < [2 * centre[1], 2 * centre[0]])).all(axis=1)]
-    x, y = places.astype(np.int64).T
+    correlation *= np.where(overlap >= _OVERLAP * level, 1 / np.sqrt(np.maximum(overlap, _OVERLAP * level) * level), 0)
+    places = local_maxima(correlation.astype(np.float32), float(_MARGIN), _ORDERED / 4)
+    inside = (places > 0) & (places < np.array(correlation.shape[::-1]) - 1)
+    x, y = places[inside.all(axis=1)].astype(np.int64).T
     heights = correlation[y, x]
     shifts = np.stack([x + _vertex(correlation, y, x, 0, 1), y + _vertex(correlation, y, x, 1, 0)], axis=1)
     shifts -= centre[::-1]
     half = (y > centre[0]) | ((y == centre[0]) & (x > centre[1]))
-    half &= np.hypot(shifts[:, 0], shifts[:, 1]) > 3
+    half &= np.hypot(shifts[:, 0], shifts[:, 1]) > _MARGIN
     return heights[half], shifts[half]
+
+
+def _correlate(image: Floats) -> Floats:
+    """Return the autocorrelation of an image for shifts of up to half of it.
+
+    Only one of each opposite pair of shifts is there: down by -3 px (``_MARGIN``) and more, along x the middle is zero.
+    """
+    down, across = (n // 2 for n in image.shape)
+    size = [fft.next_fast_len(n + n // 2 + 1, real=True) for n in image.shape]
+    spectrum = np.abs(fft.rfft2(image.astype(np.float32), s=size)) ** 2
+    whole = fft.irfft2(spectrum, s=size)
+    rows, columns = np.arange(-_MARGIN, down + 1), np.arange(-across, across + 1)
+    return np.ascontiguousarray(whole[rows][:, columns])
 
 
 def _vertex(values: Floats, y: NDArray[np.int64], x: NDArray[np.int64], dy: int, dx: int) -> Floats:
@@ -163,17 +237,31 @@ def _vertex(values: Floats, y: NDArray[np.int64], x: NDArray[np.int64], dy: int,
     return np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
 
 
-def smooth(image: Floats, sigma: float) -> Places:
-    """Return ``image`` smoothed by about a Gaussian of ``sigma`` px: three passes of a box, whatever its width."""
-    radius = round((np.sqrt(4 * sigma**2 + 1) - 1) / 2)
-    return np.asarray(box_means(box_means(box_means(image, radius), radius), radius))
+def smooth(image: Floats, sigma: float) -> Floats:
+    """Return ``image`` smoothed by about a Gaussian of ``sigma`` px, three passes of a box; a wide one on bins."""
+    step = _coarseness(sigma)
+    radius = round((np.sqrt(4 * (sigma / step) ** 2 + 1) - 1) / 2)
+    bins = image if step == 1 else binned(image, step)
+    for _ in range(3):
+        bins = box_means(bins, radius)
+    return bins if step == 1 else expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
+
+
+def _coarseness(sigma: float) -> int:
+    """Return how far an image may be binned before it is smoothed by ``sigma`` px."""
+    return max(1, int(sigma / _COARSE))
 
 
 def pixel_noise(image: Floats, valid: Mask) -> float:
-    """Return the standard deviation of the white noise of an image, from its second differences (Immerkær 1996)."""
-    kernel = np.outer([1, -2, 1], [1, -2, 1]) / 6
-    differences = np.abs(ndimage.convolve(np.asarray(image, dtype=np.float64), kernel, mode="nearest"))
-    return float(np.median(differences[valid]) / 0.6745)
+    """Return the standard deviation of the white noise of an image, from its second differences (Immerkær 1996).
+
+    Of a large image some rows are taken.
+    """
+    ny, nx = image.shape
+    rows = np.arange(1, ny - 1, max(1, ny * nx // _SAMPLE))
+    bend = image[rows - 1] - 2 * image[rows] + image[rows + 1]
+    bend = np.abs(bend[:, :-2] - 2 * bend[:, 1:-1] + bend[:, 2:]) / 6
+    return float(np.median(bend[valid[rows, 1:-1]]) / 0.6745)
 
 
 def damping(sigma: float) -> float:
@@ -181,19 +269,22 @@ def damping(sigma: float) -> float:
     return min(1.0, 1 / (2 * np.sqrt(np.pi) * sigma)) if sigma > 0 else 1.0
 
 
-def relief(image: Floats, spacing: float, blur_sigma_px: float) -> tuple[Floats, float]:
-    """Return an image in which columns stand out, and the share of white noise that is left in it.
+def relief(
+    image: Floats, valid: Mask, noise: float, spacing: float, blur_sigma_px: float, precision_px: float = np.inf
+) -> Relief:
+    """Return the image in which columns ``spacing`` px apart stand out.
 
-    Blurred to 0.08 of the spacing (a column is about twice as wide), less the surroundings over a third of it.
+    Binned to 24 px a spacing, but to no more than ``precision_px``; blurred to 0.08 of the spacing (a column is about
+    twice as wide); less the surroundings over a third of it.
     """
-    sigma = max(blur_sigma_px, 0.08 * spacing)
-    fine = blur(np.asarray(image, dtype=np.float32), sigma)
-    return fine - smooth(fine, spacing / 3), damping(sigma)
+    step = max(1, int(min(spacing / _PX_PER_SPACING, precision_px)))
+    sigma = max(blur_sigma_px, 0.08 * spacing) / step
+    fine = blur(binned(image, step).astype(np.float32), sigma)
+    height = (fine - smooth(fine, spacing / 3 / step)).astype(np.float32)
+    return Relief(height, binned(valid, step) == 1, damping(sigma) * noise / step, step)
 
 
-def find_peaks(
-    relief: Floats, valid: Mask, lattice: Lattice | None, spacing: float, noise: float, min_amplitude: float
-) -> Places:
+def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_amplitude: float) -> Places:
     """Return the columns of the dominant sublattice and strong ones beside it, (n, 2) of (x, y), strongest first.
 
     1. Peaks: local maxima of ``relief`` within a fifth of the spacing, four times its noise high or more.
@@ -212,20 +303,21 @@ def find_peaks(
 
     Parameters
     ----------
-    relief, valid
-        (y, x); columns bright. Peaks are looked for where ``valid``.
+    relief
+        Peaks are looked for where it is valid.
     lattice
         None: there is no growth, and strong peaks at least 0.75 spacings apart are returned.
-    spacing, noise
-        px, and the standard deviation of ``relief`` where there is nothing.
+    spacing
+        In px, as the lattice.
     """
-    floor = max(_SIGNIFICANT * noise, 1e-9 * float(np.ptp(relief)))
-    peaks = local_maxima(relief, max(TOLERANCE * spacing, 1.5), floor)
+    height = relief.height
+    floor = max(_SIGNIFICANT * relief.noise, 1e-9 * float(np.ptp(height)))
+    peaks = local_maxima(height, max(TOLERANCE * spacing / relief.step, 1.5), floor)
     x, y = peaks.astype(np.int64).T
-    inside = ndimage.binary_erosion(valid)[y, x]  # a maximum on the rim is the flank of a column outside
-    strongest_first = np.argsort(-relief[y, x], kind="stable")
+    inside = ndimage.binary_erosion(relief.valid)[y, x]  # a maximum on the rim is the flank of a column outside
+    strongest_first = np.argsort(-height[y, x], kind="stable")
     strongest_first = strongest_first[inside[strongest_first]]
-    peaks, weights = peaks[strongest_first], relief[y, x][strongest_first]
+    peaks, weights = relief.px(peaks[strongest_first]), height[y, x][strongest_first]
     if not len(peaks):
         return np.empty((0, 2))
     taken = np.zeros(len(peaks), dtype=bool)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from .kernels.binning import FACTOR
 from .settings import ConvertSettings
+from .shard_files import Grid
 
 LEVEL_DTYPE = np.dtype(np.float32)
 """Pixel type of the binned levels."""
@@ -20,14 +21,6 @@ _CHUNK_FRAMES = 16
 _SMALLEST_LEVEL_PX = 64
 _COMPRESSION = 2
 """Ratio that is counted on when the free space is checked; low-dose counts reach about 3."""
-
-
-class Grid(NamedTuple):
-    """Shape of an array, of its inner chunks and of its shards, each (t, y, x)."""
-
-    shape: tuple[int, int, int]
-    chunk: tuple[int, int, int]
-    shard: tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -89,18 +82,15 @@ def plan_layout(
 
 
 def peak_memory(layout: Layout) -> int:
-    """Return the bytes that a task needs at its peak to convert one shard, above the process itself (about 250 MB).
+    """Return the bytes that a task needs at its peak, above the process itself (about 250 MB), with a fifth to spare.
 
-    The frames as read, their copy where they are padded to whole tiles, the codec pipeline's copy, the encoded tiles
-    and the shard that they are joined to (each at worst as large as the frames), the binned levels, the sums and counts
-    of one frame's bins, and a fifth for what the allocator keeps.
+    To convert a shard: a layer of tiles, up to two more of frames that are read ahead, a layer of the binned levels,
+    and the sums and counts of one frame's bins. To fit its columns: the tiles of the shard.
     """
-    grid = layout.grid()
-    block = _bytes((grid.shard[0], *grid.shape[1:]), layout.dtype)
-    padded = _bytes(grid.shard, layout.dtype)
-    levels = sum(_bytes(layout.grid(factor).shard, LEVEL_DTYPE) for factor in layout.bins)
+    layers = [_bytes((layout.chunk[0], *layout.grid().shard[1:]), layout.dtype)] * 3
+    layers += [_bytes((layout.chunk[0], *layout.grid(factor).shard[1:]), LEVEL_DTYPE) for factor in layout.bins]
     sums = 16 * math.prod(layout.grid(FACTOR).shape[1:])
-    return int(1.2 * (block + (padded if padded != block else 0) + 3 * padded + levels + sums))
+    return int(1.2 * max(sum(layers) + sums, _bytes(layout.grid().shard, layout.dtype)))
 
 
 def disk_bytes(layout: Layout, settings: ConvertSettings) -> int:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,13 +12,14 @@ from typing import Any, TypeAlias
 import dask.array as da
 import numpy as np
 import xarray as xr
-import zarr
 from numpy.typing import NDArray
 
 from . import schema, stores
 from .errors import StoreError
+from .kernels.filters import Tiles
 from .ome import AXES
-from .shards import Shard, journal_beside, split
+from .shard_files import Grid, ShardReader, overlaps, shard_path
+from .shards import Shard, Shards, entries, journal_beside, split
 
 Frames: TypeAlias = NDArray[Any]
 _EVERYTHING = slice(None)
@@ -44,7 +46,7 @@ def open_movie(path: str | Path) -> Movie:
     shape = tuple(present["shape"])
     if not present["complete"]:
         n_shards = len(split(shape[0], present["frames_per_shard"]))
-        n_done = len(list(journal_beside(path).glob("[0-9]*.json")))
+        n_done = len({index for index, _ in entries(journal_beside(path))})
         raise StoreError(
             f"the movie is unfinished: {n_shards - n_done} of {n_shards} shards are missing",
             str(path),
@@ -108,7 +110,7 @@ class Movie:
         return self.shape[1] * self.shape[2] * self.dtype.itemsize
 
     @property
-    def shards(self) -> tuple[Shard, ...]:
+    def shards(self) -> Shards:
         """The shards, in order: every frame in exactly one."""
         return split(self.n_frames, self.frames_per_shard)
 
@@ -117,33 +119,46 @@ class Movie:
 
         Only the tiles that the part touches are read.
         """
-        return self._part("0", slice(start, stop), y, x)
+        return self._part("0", start, stop, y, x)
 
-    def read_boxes(self, start: int, stop: int, boxes: NDArray[np.int64]) -> Frames:
-        """Return frames ``start`` to ``stop`` (not included), whole fields, read only where boxes are; (frames, y, x).
+    def read_tiles(self, start: int, stop: int, boxes: NDArray[np.int64]) -> Tiles:
+        """Return the tiles of frames ``start`` to ``stop`` (not included) that boxes touch, as they are decoded.
 
         Parameters
         ----------
+        start, stop
+            Inside one shard; ``start`` the first frame of a layer of its tiles, as that of a shard is.
         boxes
             (n, 4) first row, first column, last row and last column (not included) of each; clipped to the field.
-
-        Notes
-        -----
-        Tiles that no box touches are never written to, so they take up no memory; their values mean nothing.
         """
-        tile = _open_level(self.path, self.key, "0").chunks[1:]
-        touched = np.zeros([-(-length // side) for length, side in zip(self.shape[1:], tile, strict=True)], dtype=bool)
-        first = np.maximum(boxes[:, :2], 0) // tile
-        last = -(-np.clip(boxes[:, 2:], 0, self.shape[1:]) // tile)
-        for (y0, x0), (y1, x1) in np.unique(np.stack([first, last], axis=1), axis=0):
-            touched[y0:y1, x0:x1] = True
-        frames = np.empty((stop - start, *self.shape[1:]), self.dtype)
-        for row, tiles in enumerate(touched):
-            edges = np.flatnonzero(np.diff(tiles, prepend=False, append=False))
-            for left, right in edges.reshape(-1, 2) * tile[1]:
-                part = slice(row * tile[0], (row + 1) * tile[0]), slice(left, right)
-                frames[:, *part] = self.read(start, stop, *part)
-        return frames
+        level = _open_level(self.path, self.key, "0")
+        depth, height, width = level.grid.chunk
+        place = _touched(boxes, self.shape[1:], (height, width))
+        wanted = np.argwhere(place >= 0).tolist()
+        number, first = divmod(start, self.frames_per_shard)
+        layers = range(first // depth, -(-(stop - number * self.frames_per_shard) // depth))
+        pixels = np.empty((len(wanted), len(layers) * depth, height, width), self.dtype)
+        with self._shard("0", number) as reader:
+            for k, layer in enumerate(layers):
+                for tile, (row, column) in zip(pixels, wanted, strict=True):
+                    reader.read_tile(layer, row, column, tile[k * depth : (k + 1) * depth])
+        return Tiles(pixels, place, self.shape[1:])
+
+    def tiles(self, shard: Shard) -> Iterator[tuple[int, int, int, Frames]]:
+        """Yield the tiles of a shard of the movie: first frame, row and column, and pixels (frames, y, x).
+
+        The pixels are valid until the next tile: all are decoded into the same memory.
+        """
+        level = _open_level(self.path, self.key, "0")
+        depth, height, width = level.grid.chunk
+        _, rows, columns = level.grid.tiles
+        tile = np.empty(level.grid.chunk, level.dtype)
+        with self._shard("0", shard.index) as reader:
+            for layer, row, column in np.ndindex(-(-shard.frames // depth), rows, columns):
+                reader.read_tile(layer, row, column, tile)
+                start, top, left = layer * depth, row * height, column * width
+                pixels = tile[: shard.frames - start, : self.shape[1] - top, : self.shape[2] - left]
+                yield shard.start + start, top, left, pixels
 
     def read_binned(self, factor: int, start: int, stop: int) -> NDArray[np.float32]:
         """Return frames ``start`` to ``stop`` (not included) of a binned level: means (frames, y, x).
@@ -158,7 +173,7 @@ class Movie:
             raise StoreError(
                 "the movie has no such binned level", str(self.path), levels, str(factor), "Use one of these"
             )
-        return self._part(f"binned/{factor}", slice(start, stop), _EVERYTHING, _EVERYTHING)
+        return self._part(f"binned/{factor}", start, stop, _EVERYTHING, _EVERYTHING)
 
     def statistics(self) -> xr.Dataset:
         """Return the per-frame statistics (``schema.STATISTICS``) on ``t``, in memory."""
@@ -181,13 +196,29 @@ class Movie:
         attributes = {name: value for name, value in known.items() if value is not None}
         return xr.DataArray(pixels, {axis: store[axis] for axis in AXES}, AXES, "movie", attributes)
 
-    def _part(self, name: str, *part: slice) -> Frames:
+    def _part(self, name: str, start: int, stop: int, y: slice, x: slice) -> Frames:
+        level = _open_level(self.path, self.key, name)
+        y, x = (slice(*span.indices(length)[:2]) for span, length in zip((y, x), level.grid.shape[1:], strict=True))
+        start, stop, _ = slice(start, stop).indices(self.n_frames)
+        part = np.empty((stop - start, max(0, y.stop - y.start), max(0, x.stop - x.start)), level.dtype)
+        for number, inside, place in overlaps(slice(start, stop), self.frames_per_shard):
+            with self._shard(name, number) as reader:
+                reader.read((inside, y, x), part[place])
+        return part
+
+    @contextmanager
+    def _shard(self, name: str, number: int) -> Iterator[ShardReader]:
+        """Open a shard of the frames or of a binned level; what is wrong with it becomes a StoreError."""
+        level = _open_level(self.path, self.key, name)
+        path = shard_path(self.path / name, number)
         try:
-            return np.asarray(_open_level(self.path, self.key, name)[part])
-        except RuntimeError as error:  # what the zarrs pipeline raises, whatever is wrong
+            with ShardReader(path, level.grid, level.dtype, encoded=level.encoded) as reader:
+                yield reader
+        except (OSError, ValueError) as error:
+            shard = self.shards[number]
             raise StoreError(
-                f"frames {part[0].start} to {part[0].stop - 1} cannot be read",
-                str(self.path / name),
+                f"frames {shard.start} to {shard.stop - 1} cannot be read",
+                str(path),
                 got=str(error),
                 remedy="The shard is damaged: remove the store and convert the movie again",
             ) from error
@@ -209,10 +240,30 @@ class _LazyFrames:
         return self.movie.dtype
 
     def __getitem__(self, part: Any) -> Frames:
-        return np.asarray(_open_level(self.movie.path, self.movie.key, "0")[part])
+        return np.asarray(stores.open_array(self.movie.path / "0")[part])
+
+
+@dataclass(frozen=True)
+class _Level:
+    """How the frames, or a binned level, lie on disk; ``encoded`` unless their codec is ``none``."""
+
+    grid: Grid
+    dtype: np.dtype[Any]
+    encoded: bool
 
 
 @lru_cache(maxsize=32)
-def _open_level(path: Path, key: str, name: str) -> zarr.Array[Any]:
-    """Open an array of a movie once in a process; the key tells a store from another later at the same place."""
-    return stores.open_array(path / name)
+def _open_level(path: Path, key: str, name: str) -> _Level:
+    """Read how a level lies on disk, once in a process; the key tells a store from another later at the same place."""
+    array: Any = stores.open_array(path / name)
+    return _Level(Grid(array.shape, array.chunks, array.shards), array.dtype, bool(array.compressors))
+
+
+def _touched(boxes: NDArray[np.int64], shape: tuple[int, ...], tile: tuple[int, int]) -> NDArray[np.int64]:
+    """Return a number for every tile (rows, columns) that a box touches, counted in their order; -1 for the others."""
+    touched = np.zeros([-(-length // side) for length, side in zip(shape, tile, strict=True)], np.bool_)
+    first = np.maximum(boxes[:, :2], 0) // tile
+    last = -(-np.clip(boxes[:, 2:], 0, shape) // tile)
+    for (top, left), (bottom, right) in np.unique(np.stack([first, last], axis=1), axis=0).tolist():
+        touched[top:bottom, left:right] = True
+    return np.where(touched, np.cumsum(touched).reshape(touched.shape) - 1, -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from time import perf_counter
@@ -41,20 +42,14 @@ class Passes:
         assert self._folder is not None
         return Journal(self._folder / name, key)
 
-    def begin(self, runs: list[tuple[Journal, tuple[Shard, ...]]]) -> None:
+    def begin(self, runs: list[tuple[Journal, Sequence[Shard]]]) -> None:
         """Tell that the stage begins, and how much of it is done."""
-        done = sum(
-            shard.frames
-            for journal, shards in runs
-            for known in [journal.done()]
-            for shard in shards
-            if shard.index in known
-        )
+        done = sum(journal.frames_done(shards) for journal, shards in runs)
         self.on_event(
             StageStarted(self.name, self.runs * self.movie.n_frames, done, 0, self.movie.frame_bytes, self.runs)
         )
 
-    def run(self, task: Any, shards: tuple[Shard, ...], journal: Journal) -> dict[int, Payload]:
+    def run(self, task: Any, shards: Sequence[Shard], journal: Journal) -> dict[int, Payload]:
         """Run the task on the shards that are not done; return the payloads of all."""
 
         def tell(shard: Shard, payload: Payload) -> None:

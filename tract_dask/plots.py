@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -23,6 +24,8 @@ COLOURS = ("#56B4E9", "#E69F00", "#2CC295", "#CC79A7", "#F0E442", "#D55E00", "#F
 """One for each kind: the colour-blind can tell them apart, on grey too (after Okabe and Ito)."""
 
 DPI = 150
+_PNG = {"compress_level": 1}
+"""Noise does not compress: higher levels take three times as long for the same size."""
 _SIDE_INCHES = 7.5
 _NARROW_INCHES = 3.6
 _LINE_INCHES = 0.24
@@ -54,8 +57,7 @@ def plot_columns(summed: xr.Dataset, columns: xr.Dataset, path: str | Path | Non
     """
     schema.validate(summed, schema.SUM, "summed image")
     schema.validate(columns, schema.COLUMNS, "columns")
-    image = summed["image"].where(summed["exposure"] > 0).to_numpy()
-    ny, nx = image.shape
+    ny, nx = summed["image"].shape
     scale = _SIDE_INCHES / max(nx, ny)
     width = max(nx * scale, _NARROW_INCHES)
     legend = _legend(columns)
@@ -66,10 +68,7 @@ def plot_columns(summed: xr.Dataset, columns: xr.Dataset, path: str | Path | Non
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, ny * scale / height))
     axes.set_axis_off()
-    known = image[np.isfinite(image)]
-    low, high = np.percentile(known, [0.5, 99.7]) if known.size else (0.0, 1.0)
-    axes.imshow(image, cmap=mpl.colormaps["gray"].with_extremes(bad="#c8d0d8"), vmin=low, vmax=high)
-    axes.set(xlim=(-0.5, nx - 0.5), ylim=(ny - 0.5, -0.5))
+    _show(axes, summed)
     _mark(axes, columns, 72 * scale)
     figure.legend(
         handles=legend,
@@ -88,8 +87,37 @@ def plot_columns(summed: xr.Dataset, columns: xr.Dataset, path: str | Path | Non
         figure.add_axes((0, 1 - strip / height, 1, strip / height)), nx, strip / scale, width / scale, pixel_size
     )
     if path is not None:
-        figure.savefig(path, dpi=DPI)
+        options: dict[str, Any] = {"pil_kwargs": _PNG} if Path(path).suffix == ".png" else {}
+        figure.savefig(path, dpi=DPI, **options)
     return figure
+
+
+def _show(axes: Axes, summed: xr.Dataset) -> None:
+    """Draw the summed image, in grey where it is exposed, with pixels of the movie as coordinates.
+
+    A large image is first binned to about the figure's own pixels, which matplotlib would do at many times the cost.
+    """
+    exposed = (summed["exposure"] > 0).to_numpy()
+    image = np.where(exposed, summed["image"].to_numpy(), 0.0)
+    ny, nx = image.shape
+    step = max(1, round(max(ny, nx) / (_SIDE_INCHES * DPI)))
+    count = _block_sums(exposed, step)
+    shown = np.where(count > 0, _block_sums(image, step) / np.maximum(count, 1), np.nan)
+    known = shown[count > 0]
+    low, high = np.percentile(known, [0.5, 99.7]) if known.size else (0.0, 1.0)
+    below, right = step * np.array(shown.shape) - 0.5
+    grey = mpl.colormaps["gray"].with_extremes(bad="#c8d0d8")
+    axes.imshow(shown, cmap=grey, vmin=low, vmax=high, extent=(-0.5, right, below, -0.5))
+    axes.set(xlim=(-0.5, nx - 0.5), ylim=(ny - 0.5, -0.5))
+
+
+def _block_sums(image: NDArray[Any], step: int) -> NDArray[np.float64]:
+    """Return the sums of blocks of ``step`` x ``step`` pixels; those at the right and the bottom may be smaller."""
+    ny, nx = (-(-size // step) for size in image.shape)
+    whole = np.zeros((ny * step, nx * step), image.dtype)
+    whole[: image.shape[0], : image.shape[1]] = image
+    rows = whole.reshape(ny, step, nx * step).sum(axis=1, dtype=np.float64)
+    return np.asarray(rows.reshape(ny, nx, step).sum(axis=2))
 
 
 def _states(columns: xr.Dataset) -> NDArray[np.int64]:

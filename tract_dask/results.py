@@ -12,13 +12,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import zarr
+from zarr.codecs import BloscCodec
 
 from . import schema, stores
 from .errors import StoreError
 from .schema import REJECTED, Status
+from .shard_files import BLOSC, encode
 from .shards import Shard
 
-_FITTED = ("fit", "stderr", "intensity", "intensity_error")
+_CODEC = "lz4"
+_FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
 _KNOWN_AT_START = ("drift_measured", "time")
 
 
@@ -69,6 +72,7 @@ def create(
                     shape=shape,
                     chunks=(min(frames_per_shard, shape[0]), *shape[1:]),
                     dtype=variable.dtype,
+                    compressors=BloscCodec(**BLOSC[_CODEC]),
                     fill_value=variable.fill,
                     dimension_names=variable.dims,
                     attributes=variable.attributes,
@@ -77,17 +81,19 @@ def create(
         aside.replace(path)
 
 
-def write(path: Path, shard: Shard, values: dict[str, np.ndarray[Any, Any]]) -> None:
-    """Write the values of every variable for the frames of ``shard``: one whole chunk each."""
-    group = zarr.open_group(str(path), mode="r+")
-    with stores.disk_errors(path):
-        for name, array in values.items():
-            target = group[name]
-            if not isinstance(target, zarr.Array):
-                raise StoreError(
-                    "a variable is not an array", f"{path}/{name}", remedy="Delete the store and fit again"
-                )
-            target[shard.start : shard.stop] = array
+def write(path: Path, shard: Shard, values: dict[str, np.ndarray[Any, Any]], frames_per_shard: int) -> None:
+    """Write the values of every variable for the frames of ``shard``: one whole chunk each, encoded here.
+
+    Chunks have the frames of a whole shard; that of the last shard is filled up.
+    """
+    for name, array in values.items():
+        variable = schema.RESULTS[name]
+        chunk = np.full((frames_per_shard, *array.shape[1:]), variable.fill, variable.dtype)
+        chunk[: shard.frames] = array
+        place = path.joinpath(name, "c", str(shard.index), *["0"] * (array.ndim - 1))
+        with stores.disk_errors(path):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            stores.write_aside(place, bytes(encode(chunk, _CODEC)))
 
 
 def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:

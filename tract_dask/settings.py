@@ -171,10 +171,24 @@ class FitSettings(Settings):
     """How a column is fitted in every frame."""
 
     window_px: int | None = setting(
-        None, "Side of the fitted window, odd; unset: half the spacing", unit="px", low=5, high=501
+        None, "Diameter of the round window that is fitted, odd; unset: half the spacing", unit="px", low=5, high=501
+    )
+    estimator: str = setting(
+        "lsq",
+        "Least squares on blurred pixels, or maximum likelihood on raw counts (poisson), best where contrast is high",
+        choices=("lsq", "poisson"),
+    )
+    shape: str = setting(
+        "fixed",
+        "Sigmas and theta of a column stay as in the summed image, or are fitted in every frame (free, the paper's)",
+        choices=("fixed", "free"),
     )
     blur_sigma_px: float = setting(
-        2.0, "Gaussian blur before the fit (the paper's 2 px); 0 fits raw pixels", unit="px", low=0, high=20
+        2.0,
+        "Gaussian blur (the paper's 2 px) before columns, noise and lsq fits are looked at; 0 leaves pixels raw",
+        unit="px",
+        low=0,
+        high=20,
     )
     max_shift_px: float | None = setting(
         None,
@@ -183,12 +197,14 @@ class FitSettings(Settings):
         low=0.1,
     )
     sigma_factor: float = setting(
-        1.3, "Sigmas stay within this factor of those in the summed image", low=1.01, high=100
+        1.3, "Free sigmas stay within this factor of those in the summed image", low=1.01, high=100
     )
     amplitude_factor: float = setting(
         5.0, "Amplitude stays below this factor of that in the summed image", low=1.01, high=1e6
     )
-    threshold: float = setting(2.0, "Accept a fit where the amplitude exceeds this times the noise", low=0, high=100)
+    threshold: float = setting(
+        1.6, "Accept a fit where the amplitude exceeds this times the noise (the paper's 2)", low=0, high=100
+    )
     counting: bool = setting(
         True, "For standard errors: the noise grows with the signal, as counts do; else it is the same in every pixel"
     )
@@ -206,6 +222,11 @@ class FitSettings(Settings):
         1e-4, "A fit has converged when its position moves less than this", unit="px", low=1e-8, high=0.1
     )
     max_iterations: int = setting(50, "Most iterations of one fit", low=1, high=10000)
+
+    @property
+    def window_blur_px(self) -> float:
+        """Sigma of the blur that windows go through before they are fitted: none where counts are."""
+        return 0.0 if self.estimator == "poisson" else self.blur_sigma_px
 
 
 @dataclass(frozen=True)

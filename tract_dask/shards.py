@@ -1,37 +1,47 @@
 """The unit of work: runs of frames, the journal of those that are done, and the loop that keeps workers busy.
 
-The journal is the truth. A task writes its shard, then its entry in the journal (aside, then renamed); whoever runs
-the same stage again reads the journal and does the rest. A task may run twice: it writes the same bytes.
+The journal is the truth. A task writes its shard, then its entry in the journal; whoever runs the same stage again
+reads the journal and does the rest. A task may run twice: it writes the same bytes.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from threading import Event, Thread
-from time import monotonic
-from typing import Any, TypeAlias
+from time import monotonic, perf_counter
+from typing import Any, TypeAlias, overload
 
+import numpy as np
 from distributed import Client, as_completed
 from distributed.scheduler import KilledWorker
+from numpy.typing import NDArray
 
 from .errors import ClusterError
-from .stores import json_ready, remove, write_aside
+from .stores import disk_errors, json_ready, remove, write_aside
 
 _PATIENCE_S = 60.0
+_BATCH_S = 0.5
+"""For so long a task goes on taking shards of its batch; a longer shard is a batch of its own."""
+
+_PROCESS = uuid.uuid4().hex[:12]
+"""Tells this process from all others, also from those on other machines."""
 
 Payload: TypeAlias = dict[str, Any]
 """What a task leaves in the journal: small, JSON-ready."""
 
+Numbers: TypeAlias = NDArray[np.int64]
+"""Indices of shards."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, slots=True)
 class Shard:
     """A run of frames, ``start`` to ``stop`` (not included); number ``index`` of the movie."""
 
@@ -45,7 +55,29 @@ class Shard:
         return self.stop - self.start
 
 
-def split(n_frames: int, frames_per_shard: int) -> tuple[Shard, ...]:
+@dataclass(frozen=True)
+class Shards(Sequence[Shard]):
+    """The shards of a movie, each made when it is asked for: a million of them take no memory."""
+
+    n_frames: int
+    frames_per_shard: int
+
+    def __len__(self) -> int:
+        return -(-self.n_frames // self.frames_per_shard)
+
+    @overload
+    def __getitem__(self, index: int) -> Shard: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Shard, ...]: ...
+    def __getitem__(self, index: int | slice) -> Shard | tuple[Shard, ...]:
+        if isinstance(index, slice):
+            return tuple(self[k] for k in range(len(self))[index])
+        number = range(len(self))[index]
+        start = number * self.frames_per_shard
+        return Shard(number, start, min(start + self.frames_per_shard, self.n_frames))
+
+
+def split(n_frames: int, frames_per_shard: int) -> Shards:
     """Return the shards of a movie: every frame in exactly one, in order.
 
     Examples
@@ -53,8 +85,7 @@ def split(n_frames: int, frames_per_shard: int) -> tuple[Shard, ...]:
     >>> [shard.frames for shard in split(10, 4)]
     [4, 4, 2]
     """
-    starts = range(0, n_frames, frames_per_shard)
-    return tuple(Shard(k, start, min(start + frames_per_shard, n_frames)) for k, start in enumerate(starts))
+    return Shards(n_frames, frames_per_shard)
 
 
 def journal_beside(path: Path) -> Path:
@@ -62,8 +93,23 @@ def journal_beside(path: Path) -> Path:
     return path.with_name(f"{path.name}.journal")
 
 
+def entries(folder: Path) -> Iterator[tuple[int, Payload]]:
+    """Yield index and payload of every entry in the journal at ``folder``; a shard that ran twice comes twice.
+
+    The last line of a process that was killed may be torn; it is no entry.
+    """
+    for file in sorted(folder.glob("*.jsonl")):
+        with file.open("rb") as lines:
+            for line in lines:
+                try:
+                    index, payload = json.loads(line)
+                except ValueError:
+                    continue
+                yield index, payload
+
+
 class Journal:
-    """The record of finished shards of one stage: a folder with one small file a shard.
+    """The record of finished shards of one stage: a folder with one file a process, to which it adds a line a shard.
 
     Parameters
     ----------
@@ -83,15 +129,26 @@ class Journal:
 
     def record(self, shard: Shard, payload: Payload) -> None:
         """Note that ``shard`` is done, with what its task returned."""
-        write_aside(self.path / f"{shard.index}.json", json.dumps(json_ready(payload)).encode())
+        line = json.dumps([shard.index, json_ready(payload)]).encode()
+        file = self.path / f"{os.getpid()}-{_PROCESS}.jsonl"
+        with disk_errors(file), file.open("ab") as log:
+            log.write(b"\n" + line + b"\n")  # the line before may be torn, by a disk that was full
 
     def done(self) -> dict[int, Payload]:
         """Return the payloads of the finished shards by index."""
-        return {int(file.stem): json.loads(file.read_bytes()) for file in self.path.glob("[0-9]*.json")}
+        return dict(entries(self.path))
+
+    def frames_done(self, shards: Sequence[Shard]) -> int:
+        """Return how many frames the finished ones of ``shards`` hold."""
+        return sum(shards[index].frames for index in {index for index, _ in entries(self.path)})
 
     def remove(self) -> None:
         """Delete the journal, once the store itself says that it is complete."""
         remove(self.path)
+
+
+def _nothing(shard: Shard, payload: Payload) -> None:
+    pass
 
 
 def run_shards(
@@ -101,18 +158,48 @@ def run_shards(
     journal: Journal,
     name: str,
     client: Client | None = None,
-    on_done: Callable[[Shard, Payload], None] = lambda shard, payload: None,
+    on_done: Callable[[Shard, Payload], None] = _nothing,
 ) -> dict[int, Payload]:
-    """Run ``task`` on every shard that the journal does not know, and return the payloads of all.
+    """Run ``task`` on every shard that the journal does not know, and return the payloads of all by index.
+
+    Arguments and errors are those of :func:`stream_shards`, which keeps nothing.
+    """
+    payloads: dict[int, Payload] = {}
+
+    def keep(shard: Shard, payload: Payload) -> None:
+        payloads[shard.index] = payload
+
+    stream_shards(task, shards, keep, journal=journal, name=name, client=client, on_done=on_done)
+    return payloads
+
+
+def stream_shards(
+    task: Callable[[Shard], Payload],
+    shards: Sequence[Shard],
+    take: Callable[[Shard, Payload], None],
+    *,
+    journal: Journal,
+    name: str,
+    client: Client | None = None,
+    on_done: Callable[[Shard, Payload], None] = _nothing,
+) -> None:
+    """Run ``task`` on every shard that the journal does not know, and hand every payload to ``take``.
+
+    On a cluster, shards that take little time go out several at once: a task takes them one by one, and notes each in
+    the journal, for about half a second.
 
     Parameters
     ----------
     task
         Takes a shard, writes its result, returns its payload. Pass paths to it, not data.
-    client
-        The cluster to run on; None runs in this process.
+    shards
+        From :func:`split`: each is sent to the workers by its place among them, which is its ``index``.
+    take
+        Called once for each shard: first for those in the journal, then for the others as they are done.
     name
         Stage name, shown on the dashboard.
+    client
+        The cluster to run on; None runs in this process.
     on_done
         Called with each shard that this call finished, as it comes.
 
@@ -123,58 +210,108 @@ def run_shards(
     ClusterError
         Where workers die under a task again and again.
     """
-    payloads = journal.done()
-    todo = [shard for shard in shards if shard.index not in payloads]
-    work = partial(_run_one, task, journal)
-    for shard, payload in _run_here(work, todo) if client is None else _run_on(client, work, todo, name):
-        payloads[shard.index] = payload
-        on_done(shard, payload)
-    return payloads
+    missing = np.ones(len(shards), dtype=np.bool_)
+    for index, payload in entries(journal.path):
+        if missing[index]:
+            missing[index] = False
+            take(shards[index], payload)
+    todo = np.flatnonzero(missing)
+    work = partial(_work, task, shards, journal)
+    with closing(_run_here(work, todo) if client is None else _run_on(client, work, todo, shards, name)) as finished:
+        for index, payload in finished:
+            take(shards[index], payload)
+            on_done(shards[index], payload)
 
 
-def _run_one(task: Callable[[Shard], Payload], journal: Journal, shard: Shard) -> Payload:
-    payload = task(shard)
-    journal.record(shard, payload)
-    return payload
+Work: TypeAlias = Callable[[Numbers], tuple[list[Payload], float]]
+Finished: TypeAlias = Generator[tuple[int, Payload], None, None]
 
 
-def _run_here(work: Callable[[Shard], Payload], todo: Iterable[Shard]) -> Iterable[tuple[Shard, Payload]]:
-    for shard in todo:
-        yield shard, work(shard)
+def _work(
+    task: Callable[[Shard], Payload], shards: Sequence[Shard], journal: Journal, batch: Numbers
+) -> tuple[list[Payload], float]:
+    """Do the shards of a batch until its time is up; return the payloads of those that are done, and the seconds."""
+    began = perf_counter()
+    payloads = []
+    for index in batch.tolist():
+        payloads.append(task(shards[index]))
+        journal.record(shards[index], payloads[-1])
+        if perf_counter() - began > _BATCH_S:
+            break
+    return payloads, perf_counter() - began
 
 
-def _run_on(
-    client: Client, work: Callable[[Shard], Payload], todo: Sequence[Shard], name: str
-) -> Iterable[tuple[Shard, Payload]]:
-    """Keep a bounded window of futures in flight, so that neither driver nor scheduler grows with the movie."""
-    threads = max(1, sum(client.nthreads().values()))
+def _run_here(work: Work, todo: Numbers) -> Finished:
+    for k in range(len(todo)):
+        (payload,), _ = work(todo[k : k + 1])
+        yield int(todo[k]), payload
+
+
+class _Queue:
+    """The shards that are still to do, in order; what a batch left undone comes first again."""
+
+    def __init__(self, todo: Numbers) -> None:
+        self._runs, self.left = [todo], len(todo)
+
+    def take(self, count: int) -> Numbers:
+        """Return the next shards, ``count`` of them or fewer."""
+        run = self._runs.pop()
+        if len(run) > count:
+            self._runs.append(run[count:])
+        self.left -= len(run[:count])
+        return run[:count]
+
+    def give_back(self, run: Numbers) -> None:
+        """Put shards in front of all others."""
+        if len(run):
+            self._runs.append(run)
+            self.left += len(run)
+
+
+def _run_on(client: Client, work: Work, todo: Numbers, shards: Sequence[Shard], name: str) -> Finished:
+    """Keep a bounded window of batches in flight, so that neither driver nor scheduler grows with the movie."""
+    window = 4 * max(1, sum(client.nthreads().values())) + 4
     token = uuid.uuid4().hex
-    waiting = iter(todo)
-    running: dict[Any, Shard] = {}
+    queue, size = _Queue(todo), 1
+    running: dict[Any, Numbers] = {}
 
-    def submit(shard: Shard) -> Any:
-        future = client.submit(work, shard, key=(f"{name}-{token}", shard.index), pure=False)
-        running[future] = shard
+    def submit() -> Any:
+        batch = queue.take(size)
+        future = client.submit(work, batch, key=(f"{name}-{token}", int(batch[0])), pure=False)
+        running[future] = batch
         return future
 
-    completed = as_completed([submit(shard) for shard in islice(waiting, 4 * threads + 4)])
+    completed = as_completed([submit() for _ in range(min(window, queue.left))])
     ended = Event()
     Thread(target=_watch, args=(client, running, ended), daemon=True).start()
     try:
         for future in completed:
-            shard = running.pop(future)
-            with _cluster_errors(client, name, shard):
-                payload = future.result()
-            for following in islice(waiting, 1):
-                completed.add(submit(following))
-            yield shard, payload
+            batch = running.pop(future)
+            with _cluster_errors(name, shards[batch[0]].start, shards[batch[-1]].stop):
+                payloads, seconds = future.result()
+            queue.give_back(batch[len(payloads) :])
+            size = _next_size(size, len(payloads) / max(seconds, 1e-6), queue.left // (2 * window))
+            if queue.left:
+                completed.add(submit())
+            yield from zip(batch.tolist(), payloads, strict=False)
     finally:
         ended.set()
         if running and client.status == "running":
             client.cancel(list(running), force=True)
 
 
-def _watch(client: Client, running: dict[Any, Shard], ended: Event) -> None:
+def _next_size(size: int, rate: float, share: int) -> int:
+    """Return how many shards the next batch holds: as many as its time allows, at most twice as many as before.
+
+    Examples
+    --------
+    >>> _next_size(8, rate=1000.0, share=100), _next_size(8, rate=4.0, share=100), _next_size(8, rate=1000.0, share=0)
+    (16, 2, 1)
+    """
+    return max(1, min(int(rate * _BATCH_S), 2 * size, share))
+
+
+def _watch(client: Client, running: Iterable[Any], ended: Event) -> None:
     """Cancel what is running once the cluster has had no worker for a minute: nobody would ever finish it."""
     alone_since = monotonic()
     while not ended.wait(1.0):
@@ -188,13 +325,13 @@ def _watch(client: Client, running: dict[Any, Shard], ended: Event) -> None:
 
 
 @contextmanager
-def _cluster_errors(client: Client, name: str, shard: Shard) -> Iterator[None]:
+def _cluster_errors(name: str, start: int, stop: int) -> Iterator[None]:
     """Turn what the cluster says of a lost task into a ClusterError."""
     try:
         yield
     except KilledWorker as error:
         raise ClusterError(
-            f"workers died again and again under frames {shard.start} to {shard.stop - 1} in stage {name}",
+            f"workers died again and again under frames {start} to {stop - 1} in stage {name}",
             str(error.last_worker.address),
             remedy="Give them more memory (--memory-limit) or make shards smaller (--shard-mb), and run again",
         ) from error

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import schema
-from .kernels.registration import add_shifted, overlap
+from .kernels.sums import add_frames, coverage
 from .movie import Movie
 from .passes import Passes, save_array
 from .progress import Sink, silent
@@ -24,9 +24,6 @@ Bools = NDArray[np.bool_]
 
 SUM_PARTS = 16
 """The sum is made in at most this many parts, whatever the number of workers."""
-
-_BLOCK_BYTES = 64 << 20
-_CHUNK_FRAMES, _CHUNK_ROWS = 16, 256
 
 
 def sum_image(
@@ -71,10 +68,10 @@ def sum_image(
         done = stage.journal("parts", stage_key(movie.key, shift.tobytes(), used.tobytes()))
         stage.begin([(done, parts)])
         payloads = stage.run(partial(_sum_part, movie, shift, used, done.path), parts, done)
-        exposure = _coverage(movie.shape[1:], shift[used])
+        exposure = coverage(movie.shape[1:], shift[used])
         total = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max))
         for part in parts:
-            np.add(total, np.load(done.path / f"{part.index}.npy"), out=total, casting="same_kind")
+            add_frames(total, np.load(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
             if payloads[part.index]["missing"]:
                 exposure -= np.load(done.path / f"{part.index}-missing.npy")
         image = np.divide(total * movie.gain, exposure, out=np.zeros(total.shape), where=exposure > 0)
@@ -112,40 +109,17 @@ def _sum_part(movie: Movie, shift: NDArray[np.int64], used: Bools, folder: Path,
     """Add up some frames at their places; leave the sum, and a count of pixels that hold no number, in ``folder``."""
     total = np.zeros(movie.shape[1:], _accumulator(movie, part.frames))
     missing = np.zeros(movie.shape[1:] if movie.dtype.kind == "f" else (0, 0), np.int64)
-    for start, stop, rows in _blocks(movie, part):
-        block = movie.read(start, stop, rows)
-        finite = np.isfinite(block) if missing.size else None
-        for k in np.flatnonzero(used[start:stop]):
-            place = int(shift[start + k, 0]) - rows.start, int(shift[start + k, 1])
-            if finite is not None and not finite[k].all():
-                add_shifted(missing, ~finite[k], place)
-                block[k][~finite[k]] = 0.0
-            add_shifted(total, block[k], place)
+    first, last = part.start // movie.frames_per_shard, -(-part.stop // movie.frames_per_shard)
+    for start, top, left, tile in chain.from_iterable(map(movie.tiles, movie.shards[first:last])):
+        here = slice(start, start + len(tile))
+        frames, places = tile, shift[here] - [top, left]
+        if not used[here].all():
+            frames, places = frames[used[here]], places[used[here]]
+        if missing.size and not (finite := np.isfinite(frames)).all():
+            add_frames(missing, ~finite, places)
+            frames = np.where(finite, frames, 0.0)
+        add_frames(total, frames, places)
     save_array(folder / f"{part.index}.npy", total)
     if missing.any():
         save_array(folder / f"{part.index}-missing.npy", missing)
     return {"missing": bool(missing.any())}
-
-
-def _blocks(movie: Movie, part: Shard) -> Iterator[tuple[int, int, slice]]:
-    """Yield pieces of a part of the movie, of limited size and along its chunks: start, stop, rows."""
-    ny, nx = movie.shape[1:]
-    per_shard = movie.shards[0].frames
-    for first in range(part.start, part.stop, per_shard):
-        last = min(first + per_shard, part.stop)
-        step = min(last - first, max(_CHUNK_FRAMES, _BLOCK_BYTES // (ny * nx * movie.dtype.itemsize)))
-        height = max(_CHUNK_ROWS, _BLOCK_BYTES // (step * nx * movie.dtype.itemsize) // _CHUNK_ROWS * _CHUNK_ROWS)
-        for start in range(first, last, step):
-            for top in range(0, ny, height):
-                yield start, min(start + step, last), slice(top, min(top + height, ny))
-
-
-def _coverage(shape: tuple[int, ...], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many frames, moved by ``shifts``, cover each pixel."""
-    edges = np.zeros((shape[0] + 1, shape[1] + 1), np.int64)
-    for dy, dx in shifts:
-        (rows, _), (columns, _) = overlap(shape[0], shape[0], int(dy)), overlap(shape[1], shape[1], int(dx))
-        for y, sign_y in ((rows.start, 1), (rows.stop, -1)):
-            for x, sign_x in ((columns.start, 1), (columns.stop, -1)):
-                edges[y, x] += sign_y * sign_x
-    return np.asarray(edges.cumsum(axis=0).cumsum(axis=1)[:-1, :-1])

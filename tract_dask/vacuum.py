@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from .errors import SettingsError
 from .kernels.filters import blur
@@ -16,6 +15,8 @@ from .schema import AMPLITUDE
 _SHARES = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8)
 _FLAT = 0.1
 _MIN_SIDE_PX = 24
+_STEPS = 16
+"""Squares are looked for in steps of this share of the smallest one's side."""
 
 
 def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[int, int, int, int] | None:
@@ -32,17 +33,21 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
 
     Notes
     -----
-    Squares of a half down to an eighth of the frame's shorter side are tried, largest first. A square is vacuum when
+    Squares of a half down to an eighth of the frame's shorter side are tried, largest first, at every pixel of a small
+    image and at every sixteenth of the smallest square's side in a large one. A square is vacuum when
     its standard deviation is at most a tenth of the columns' amplitude, and less than twice the smallest found.
     """
     image = np.asarray(summed["image"].to_numpy(), dtype=np.float64)
     exposure = summed["exposure"].to_numpy()
     covered = exposure == exposure.max()
-    smooth = blur(image.astype(np.float32), sigma).astype(np.float64)
-    smooth -= smooth.mean()
+    smooth = blur(image.astype(np.float32), sigma)
+    smooth -= smooth.mean(dtype=np.float64)
     amplitude = float(np.nanmedian(np.abs(columns["fit_ref"].to_numpy()[:, AMPLITUDE])))
     sides = [side for share in _SHARES if (side := int(share * min(image.shape))) >= _MIN_SIDE_PX]
-    flattest = [_flattest(smooth, covered, side) for side in sides]
+    step = max(1, min(sides, default=1) // _STEPS)
+    sides = [side // step * step for side in sides]
+    tables = [_sum_table(values, step) for values in (smooth, smooth**2, covered)]
+    flattest = [_flattest(tables, side, step) for side in sides]
     best = min((spread for spread, _, _ in flattest), default=np.inf)
     for side, (spread, y, x) in zip(sides, flattest, strict=True):
         if spread <= _FLAT * amplitude and spread <= 2 * best:
@@ -81,15 +86,22 @@ def check_box(box: tuple[int, ...], shape: tuple[int, ...], drift: NDArray[np.fl
         )
 
 
-def _flattest(smooth: NDArray[np.float64], covered: NDArray[Any], side: int) -> tuple[float, int, int]:
-    """Return standard deviation and corner (y, x) of the flattest square of ``side`` px that lies in ``covered``."""
-    origin = -(side // 2)
-    mean = uniform_filter(smooth, side, mode="constant", origin=origin)
-    square = uniform_filter(smooth**2, side, mode="constant", origin=origin)
-    share = uniform_filter(covered.astype(np.float64), side, mode="constant", origin=origin)
-    spread = np.sqrt(np.maximum(square - mean**2, 0))
-    spread[share < 1 - 0.5 / side**2] = np.inf
-    spread[smooth.shape[0] - side + 1 :] = np.inf
-    spread[:, smooth.shape[1] - side + 1 :] = np.inf
+def _sum_table(values: NDArray[Any], step: int) -> NDArray[np.float64]:
+    """Return the sums of all values above and to the left of every ``step``-th pixel, beginning with zeros."""
+    ny, nx = (size // step for size in values.shape)
+    rows = values[: ny * step, : nx * step].reshape(ny, step, nx * step).sum(axis=1, dtype=np.float64)
+    table = np.zeros((ny + 1, nx + 1))
+    table[1:, 1:] = rows.reshape(ny, nx, step).sum(axis=2).cumsum(axis=0).cumsum(axis=1)
+    return table
+
+
+def _flattest(tables: list[NDArray[np.float64]], side: int, step: int) -> tuple[float, int, int]:
+    """Return standard deviation and corner (y, x) of the flattest square of ``side`` px that is covered.
+
+    ``tables`` are the sum tables (Crow 1984) of the image, its square, and the pixels that are covered.
+    """
+    n = side // step
+    mean, square, share = ((t[n:, n:] - t[n:, :-n] - t[:-n, n:] + t[:-n, :-n]) / side**2 for t in tables)
+    spread = np.where(share > 1 - 0.5 / side**2, np.sqrt(np.maximum(square - mean**2, 0)), np.inf)
     y, x = np.unravel_index(int(np.argmin(spread)), spread.shape)
-    return float(spread[y, x]), int(y), int(x)
+    return float(spread[y, x]), int(y) * step, int(x) * step

@@ -1,4 +1,4 @@
-"""How large the square is that a column is fitted in."""
+"""How large the disc is that a column is fitted in."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def neighbour_distance(places: NDArray[np.float64]) -> float | None:
 
 
 def default_window(spacing_px: float) -> int:
-    """Return the side of a window, odd, for columns at this distance from their neighbours: half of it.
+    """Return the diameter of a window, odd, for columns at this distance from their neighbours: half of it.
 
     On CeO2 in [110] it reaches the flanks of the oxygen columns, which lie at 0.42 of that distance.
 

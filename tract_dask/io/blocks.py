@@ -28,12 +28,22 @@ class BlockSource(Source):
     offsets: NDArray[np.int64]
     stored: np.dtype[Any]
 
+    @property
+    def one_by_one(self) -> bool:
+        """Whether frames that are read one by one take no longer than many at once."""
+        return True
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
-        offsets = self.offsets[start:stop]
-        frames = np.empty((len(offsets), *self.shape[1:]), self.stored)
-        if not len(offsets):
-            return frames.view(self.dtype)
+        frames = np.empty((len(self.offsets[start:stop]), *self.shape[1:]), self.dtype)
+        self.read_into(start, frames)
+        return frames
+
+    def read_into(self, start: int, frames: Frames) -> None:
+        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
+        if not len(frames):
+            return
+        offsets = self.offsets[start : start + len(frames)]
         breaks = np.flatnonzero(np.diff(offsets) != frames[0].nbytes) + 1
         try:
             with self.files[0].open("rb", buffering=0) as file:
@@ -43,7 +53,6 @@ class BlockSource(Source):
             raise unreadable(self.path, error) from error
         if self.stored != self.dtype:
             frames.byteswap(inplace=True)
-        return frames.view(self.dtype)
 
 
 def open_block(

@@ -21,6 +21,11 @@ class SequenceSource(Source):
     firsts: tuple[int, ...]
     open_file: Callable[[Path], Source]
 
+    @property
+    def one_by_one(self) -> bool:
+        """Whether frames that are read one by one take no longer than many at once."""
+        return len(self.files) == self.shape[0]
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
         start, stop, _ = slice(start, stop).indices(self.shape[0])

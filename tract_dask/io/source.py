@@ -71,8 +71,15 @@ class FrameSource(Protocol):
     def metadata(self) -> SourceMetadata:
         """Pixel size and the like; the user's word counts more than the file's."""
 
+    @property
+    def one_by_one(self) -> bool:
+        """Whether frames that are read one by one take no longer than many at once."""
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
+
+    def read_into(self, start: int, frames: Frames) -> None:
+        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
 
     def close(self) -> None:
         """Release what the reader holds open."""
@@ -92,9 +99,18 @@ class Source:
     dtype: np.dtype[Any]
     metadata: SourceMetadata
 
+    @property
+    def one_by_one(self) -> bool:
+        """Whether frames that are read one by one take no longer than many at once."""
+        return False
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
         raise NotImplementedError
+
+    def read_into(self, start: int, frames: Frames) -> None:
+        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
+        frames[...] = self.read(start, start + len(frames))
 
     def close(self) -> None:
         """Do nothing: no file stays open."""

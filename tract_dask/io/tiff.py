@@ -30,6 +30,11 @@ class PagedSource(Source):
 
     directories: NDArray[np.int64]
 
+    @property
+    def one_by_one(self) -> bool:
+        """Whether frames that are read one by one take no longer than many at once."""
+        return True
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
         directories = self.directories[start:stop]

@@ -1,21 +1,67 @@
-"""Bounded least squares of Equation 1 on many windows."""
+"""Bounded fits of Equation 1 to many windows: least squares, or maximum likelihood of counts."""
 
 from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from .covariance import Noise
+from .engine import Options, Results, fit_windows
 from .filters import gaussian_kernel
 from .gaussian import canonical
-from .least_squares import GaussianFits, Options, fit_windows
 
-__all__ = ["LARGEST_SIGMA", "SMALLEST_SIGMA_PX", "GaussianFits", "fit_gaussians"]
+__all__ = ["LARGEST_SIGMA", "SMALLEST_SIGMA_PX", "GaussianFits", "Outcome", "fit_gaussians"]
 
-SMALLEST_SIGMA_PX = 0.1
+SMALLEST_SIGMA_PX = 1.0
 """Narrower Gaussians fall between the pixels; smaller bounds count as this."""
 
 LARGEST_SIGMA = 10.0
 """In units of the window's longer side; wider Gaussians are flat, so larger bounds count as this."""
+
+
+class Outcome(IntEnum):
+    """How a fit ended."""
+
+    CONVERGED = 0
+    AT_BOUND = 1
+    """Converged, with a parameter that had any freedom on a bound."""
+    ITERATION_LIMIT = 2
+    NO_INFORMATION = 3
+    """A constant window, or one that does not say where the column is."""
+    NOT_FINITE = 4
+    """A pixel, or the start, is NaN or infinite."""
+
+
+class GaussianFits(NamedTuple):
+    """What is known of each fitted window; parameters in the order of Equation 1, positions in window pixels."""
+
+    estimates: npt.NDArray[np.float64]
+    """(n, 7), canonical: sigma_a >= sigma_b > 0, theta in (-pi/2, pi/2]. Always finite: where a window cannot be
+    fitted, the start moved onto the bounds."""
+    stderr: npt.NDArray[np.float64]
+    """(n, 7) standard errors; NaN for a parameter that is held, and where the fit has not converged."""
+    volume_stderr: npt.NDArray[np.float64]
+    """(n,) standard error of the volume 2 pi amplitude sigma_a sigma_b; NaN where the fit has not converged."""
+    r_squared: npt.NDArray[np.float32]
+    """(n,) share of the window's variance that the fit explains; 0 where there is no fit."""
+    n_iterations: npt.NDArray[np.int16]
+    """(n,) steps tried."""
+    status: npt.NDArray[np.uint8]
+    """(n,) codes of :class:`Outcome`."""
+
+    @property
+    def converged(self) -> npt.NDArray[np.bool_]:
+        """(n,) whether the last step was undamped and below the tolerance."""
+        return np.less_equal(self.status, Outcome.AT_BOUND)
+
+    @property
+    def at_bound(self) -> npt.NDArray[np.bool_]:
+        """(n,) whether the fit converged with a parameter that had any freedom on a bound."""
+        return np.equal(self.status, Outcome.AT_BOUND)
 
 
 def fit_gaussians(
@@ -24,32 +70,41 @@ def fit_gaussians(
     lower: npt.ArrayLike,
     upper: npt.ArrayLike,
     *,
+    estimator: str = "lsq",
+    fixed_shape: bool = False,
     blur_sigma_px: float = 0.0,
     counting: bool = True,
     tolerance_px: float = 1e-4,
     max_iterations: int = 50,
+    radius_px: float = math.inf,
 ) -> GaussianFits:
-    """Fit Equation 1 to each window by least squares within bounds.
+    """Fit Equation 1 to each window within bounds.
 
     Parameters
     ----------
     windows
-        (n, h, w), of any finite scale. A window with a pixel that is NaN or infinite gets NaN, not an exception.
+        (n, h, w), of any finite scale.
     start, lower, upper
         (n, 7), or (7,) for all windows: amplitude, x, y, sigma_a, sigma_b, theta, background. x and y are in px from
         the centre of the window's first pixel. The sigmas share one interval, from the smaller lower to the larger
         upper bound, because which of them is the larger is an outcome; theta's bounds are ignored, for it only labels
         an orientation. A start outside the bounds is moved onto them.
+    estimator
+        ``lsq``: least squares. ``poisson``: maximum likelihood of counts, for windows that were not blurred.
+    fixed_shape
+        Whether sigma_a, sigma_b and theta stay as in ``start``; the bounds of the sigmas then do not matter.
     blur_sigma_px
         The Gaussian blur that the windows have been through, which correlates their noise; enters the standard errors.
     counting
         Whether a raw pixel's noise variance is proportional to the model, as for counted electrons, and not the same in
-        every pixel; enters the standard errors. The noise's size is always taken from the residuals.
+        every pixel; enters the standard errors of ``lsq``. The noise's size is always taken from the residuals.
     tolerance_px
         A fit has converged when an undamped step moves the centre by less than this, and the outline of the ellipse by
         less than ten times this.
     max_iterations
         Most steps that are tried on a window.
+    radius_px
+        Pixels farther than this from the window's middle pixel (h // 2, w // 2) do not count.
 
     Returns
     -------
@@ -61,35 +116,45 @@ def fit_gaussians(
     Raises
     ------
     ValueError
-        If the shapes do not go together, or a lower bound is not at or below its upper bound.
+        If the shapes do not go together, a lower bound is not at or below its upper bound, or blurred windows are to be
+        fitted by maximum likelihood.
     """
     windows = np.ascontiguousarray(windows, dtype=np.float32)
     if windows.ndim != 3 or 0 in windows.shape[1:]:
         raise ValueError(f"windows must be (n, h, w) with pixels, got {windows.shape}")
+    if estimator not in ("lsq", "poisson"):
+        raise ValueError(f"estimator must be lsq or poisson, got {estimator!r}")
+    if estimator == "poisson" and blur_sigma_px > 0:
+        raise ValueError("maximum likelihood needs the counts themselves, not blurred ones")
     n, height, width = windows.shape
     starts, lowers, uppers = (
         np.array(np.broadcast_to(np.asarray(values, np.float64), (n, 7)), order="C") for values in (start, lower, upper)
     )
+    known = np.isfinite(starts).all(axis=1)
+    starts = canonical(np.where(np.isfinite(starts), starts, 0))
     lowers[:, 3:5] = np.maximum(lowers[:, 3:5].min(axis=1, keepdims=True), SMALLEST_SIGMA_PX)
     uppers[:, 3:5] = np.minimum(uppers[:, 3:5].max(axis=1, keepdims=True), LARGEST_SIGMA * max(height, width))
     lowers[:, 5], uppers[:, 5] = -np.inf, np.inf
+    if fixed_shape:
+        lowers[:, 3:5], uppers[:, 3:5] = SMALLEST_SIGMA_PX, LARGEST_SIGMA * max(height, width)
     if not (lowers <= uppers).all():
         row = int(np.flatnonzero(~(lowers <= uppers).all(axis=1))[0])
         raise ValueError(
             f"bounds of window {row} are empty: lower {lowers[row].tolist()}, upper {uppers[row].tolist()}"
         )
-    starts[:, 3:6] = canonical(starts)[:, 3:6]
     kernel = gaussian_kernel(blur_sigma_px).astype(np.float64)
     distances = np.arange(kernel.size) - kernel.size // 2
-    variance, power = float(kernel @ distances**2), float(kernel @ kernel) ** 2
-    options = Options(variance, power, bool(counting), float(tolerance_px), int(max_iterations))
-    fits = GaussianFits(
-        estimates=np.clip(starts, lowers, uppers),
-        stderr=np.full((n, 7), np.nan),
-        r_squared=np.zeros(n, np.float32),
-        n_iterations=np.zeros(n, np.int16),
-        converged=np.zeros(n, np.bool_),
-        at_bound=np.zeros(n, np.bool_),
+    noise = Noise(float(kernel @ distances**2), float(kernel @ kernel) ** 2, bool(counting))
+    options = Options(estimator == "poisson", bool(fixed_shape), float(tolerance_px), int(max_iterations))
+    results = Results(
+        np.clip(starts, lowers, uppers),
+        np.full((n, 7), np.nan),
+        np.full(n, np.nan),
+        np.zeros(n, np.float32),
+        np.zeros(n, np.int16),
+        np.where(known, 0, Outcome.NOT_FINITE).astype(np.uint8),
     )
-    fit_windows(windows.reshape(n, height * width), width, lowers, uppers, options, fits)
-    return fits
+    fit_windows(
+        windows.reshape(n, height * width), (height, width, float(radius_px)), lowers, uppers, options, noise, results
+    )
+    return GaussianFits(*results)

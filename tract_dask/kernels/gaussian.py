@@ -39,6 +39,26 @@ def canonical(parameters: npt.ArrayLike) -> Floats:
     return result
 
 
+def blurred(parameters: npt.ArrayLike, variance: float) -> Floats:
+    """Return what a circular Gaussian blur makes of Gaussians (..., 7): wider and lower, of the same volume.
+
+    Parameters
+    ----------
+    variance
+        The blur's, px^2. A negative one undoes a blur; it leaves at least a tenth of each sigma.
+
+    Examples
+    --------
+    >>> blurred([8.0, 0.0, 0.0, 4.0, 3.0, 0.0, 1.0], 2.0**2).round(2).tolist()
+    [5.95, 0.0, 0.0, 4.47, 3.61, 0.0, 1.0]
+    """
+    result = np.array(parameters, dtype=np.float64)
+    sigmas = result[..., 3:5].copy()
+    result[..., 3:5] = np.sqrt(np.maximum(sigmas**2 + variance, (0.1 * sigmas) ** 2))
+    result[..., 0] *= (sigmas / result[..., 3:5]).prod(axis=-1)
+    return result
+
+
 def evaluate(parameters: npt.ArrayLike, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
     """Return Equation 1 at the points (x, y).
 

@@ -105,29 +105,15 @@ def centroids(image: Floats, places: Places, radius: float) -> Places:
     return centres
 
 
-@njit(cache=True, nogil=True)
 def box_means(image: Floats, radius: int) -> Places:
     """Return the mean of the (2 radius + 1)^2 pixels around each pixel, by running sums: any radius costs the same.
 
-    Beyond the image its edge pixels go on, as in ``scipy.ndimage.uniform_filter`` with ``mode="nearest"``.
+    Beyond the image its edge pixels go on, as in ``scipy.ndimage.uniform_filter`` with ``mode="nearest"``, which takes
+    several times as long.
     """
-    ny, nx = image.shape
     side = 2 * radius + 1
-    means = np.empty((ny, nx))
-    total = np.zeros(nx)
-    for v in range(-radius, radius + 1):
-        total += image[min(max(v, 0), ny - 1)]
-    for y in range(ny):
-        means[y] = total / side
-        total += image[min(y + radius + 1, ny - 1)]
-        total -= image[max(y - radius, 0)]
-    row = np.empty(nx)
-    for y in range(ny):
-        row[:] = means[y]
-        run = 0.0
-        for u in range(-radius, radius + 1):
-            run += row[min(max(u, 0), nx - 1)]
-        for x in range(nx):
-            means[y, x] = run / side
-            run += row[min(x + radius + 1, nx - 1)] - row[max(x - radius, 0)]
-    return means
+    means = np.asarray(image, dtype=np.float64)
+    for _ in range(2):
+        sums = np.pad(means, ((radius + 1, radius), (0, 0)), mode="edge").cumsum(axis=0)
+        means = (sums[side:] - sums[:-side]).T / side
+    return np.ascontiguousarray(means)

@@ -1,0 +1,95 @@
+"""Shard files: what Zarr reads of ours, what we read of Zarr's, and what is damaged."""
+
+import numpy as np
+import pytest
+import zarr
+from zarr.codecs import BloscCodec
+
+from tract_dask.shard_files import BLOSC, Grid, ShardReader, ShardWriter, shard_path
+
+GRID = Grid(shape=(13, 30, 44), chunk=(3, 16, 15), shard=(6, 32, 45))
+CODECS = ["lz4", "zstd", "none"]
+
+
+def frames_of(dtype="u2"):
+    return np.random.default_rng(0).poisson(40, GRID.shape).astype(dtype)
+
+
+def zarr_array(path, dtype, codec):
+    return zarr.create_array(
+        str(path),
+        shape=GRID.shape,
+        chunks=GRID.chunk,
+        shards=GRID.shard,
+        dtype=dtype,
+        compressors=BloscCodec(**BLOSC[codec]) if codec in BLOSC else None,
+        fill_value=0,
+    )
+
+
+def write(path, frames, codec):
+    for number, start in enumerate(range(0, len(frames), GRID.shard[0])):
+        with ShardWriter(shard_path(path, number), path, GRID, frames.dtype, codec) as writer:
+            for frame in frames[start : start + GRID.shard[0]]:
+                writer.add(frame)
+
+
+def reader(path, number, dtype, codec):
+    return ShardReader(shard_path(path, number), GRID, np.dtype(dtype), encoded=codec in BLOSC)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8"])
+def test_zarr_reads_what_is_written(tmp_path, dtype, codec):
+    frames = frames_of(dtype)
+    array = zarr_array(tmp_path / "0", dtype, codec)
+    write(tmp_path / "0", frames, codec)
+    np.testing.assert_array_equal(array[...], frames)
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_what_zarr_writes_is_read(tmp_path, codec):
+    frames = frames_of()
+    frames[6:9, :16] = 0  # tiles that Zarr does not store
+    zarr_array(tmp_path / "0", "u2", codec)[...] = frames
+    for number, start in enumerate((0, 6, 12)):
+        stop = min(6, 13 - start)
+        out = np.ones((stop, 9, 30), np.uint16)
+        with reader(tmp_path / "0", number, "u2", codec) as shard:
+            shard.read((slice(0, stop), slice(12, 21), slice(14, 44)), out)
+        np.testing.assert_array_equal(out, frames[start : start + stop, 12:21, 14:44])
+
+
+def test_an_error_leaves_no_file(tmp_path):
+    def fail():
+        with ShardWriter(shard_path(tmp_path, 0), tmp_path, GRID, np.dtype("u2"), "lz4") as writer:
+            writer.add(frames_of()[0])
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert not [file for file in tmp_path.rglob("*") if file.is_file()]
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_damage_is_told(tmp_path, codec):
+    write(tmp_path, frames_of(), codec)
+    path = shard_path(tmp_path, 0)
+    data = path.read_bytes()
+    path.write_bytes(data[:-30] + b"x" + data[-29:])
+    with pytest.raises(ValueError, match="index at the end"), reader(tmp_path, 0, "u2", codec):
+        pass
+    path.write_bytes(data[:50])
+    with pytest.raises(ValueError, match="index at the end"), reader(tmp_path, 0, "u2", codec):
+        pass
+    if codec != "none":
+        path.write_bytes(bytes(200) + data[200:])
+        out = np.empty(GRID.chunk, np.uint16)
+        with reader(tmp_path, 0, "u2", codec) as shard, pytest.raises(ValueError, match=r"tile .* is damaged"):
+            shard.read_tile(0, 0, 0, out)
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError), reader(tmp_path, 0, "u2", "lz4"):
+        pass

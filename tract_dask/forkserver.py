@@ -1,0 +1,60 @@
+"""The process from which local workers are forked, with everything imported that they need.
+
+Started before the rest of the package is imported, it imports at the same time on another core. Workers then start at
+once, share its memory until they write to it, and end without delay; spawned ones each import everything anew.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver
+
+AVAILABLE = sys.platform == "linux"
+"""Elsewhere workers are spawned: Windows cannot fork, and on macOS system libraries do not survive it."""
+
+THREAD_VARIABLES = (
+    "NUMBA_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "RAYON_NUM_THREADS",
+    "BLOSC_NTHREADS",
+    "ZARR_THREADING__MAX_WORKERS",
+)
+ENVIRONMENT = {
+    **dict.fromkeys(THREAD_VARIABLES, "1"),
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
+}
+"""What has to be set before a worker's libraries are loaded: one thread each; and freed memory is used again.
+
+Dask's own limit for that, 64 KiB, makes the system clear the pages of every buffer anew: as much work as decoding.
+"""
+
+_PRELOAD = ["distributed", f"{__package__}.stages"]
+
+
+def start() -> None:
+    """Start the server, if it can be used here and does not run yet; it ends with this process."""
+    if AVAILABLE:
+        multiprocessing.set_forkserver_preload(_PRELOAD)
+        with _environment():
+            forkserver.ensure_running()
+
+
+@contextmanager
+def _environment() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in ENVIRONMENT}
+    os.environ.update(ENVIRONMENT)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
