@@ -31,7 +31,8 @@ def main() -> None:
     """Measure what is asked for, and print and keep the tables."""
     options = parse()
     size = SMALL if options.small else FULL
-    options.out.mkdir(parents=True, exist_ok=True)
+    for folder in filter(None, (options.out, options.work)):
+        folder.mkdir(parents=True, exist_ok=True)
     kept = options.out / "results.json"
     results = begin(kept, size)
     for name in options.only or SECTIONS:

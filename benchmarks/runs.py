@@ -25,14 +25,14 @@ def run(size: Size, work: Path) -> dict[str, Any]:
     cores = psutil.cpu_count() or 1
     movie = movies.simulate(work / "run.tif", size, size.frames)
     by_workers: dict[int, list[dict[str, Any]]] = {cores: [], 1: []}
-    for _ in range(size.repeats):
+    for _ in range(size.long_repeats):
         for workers, outcomes in by_workers.items():
             outcomes.append(measured_run(movie, work / "run", size, workers))
     by_frames: dict[int, list[dict[str, Any]]] = {}
     for share in size.shares:
         frames = size.frames // share
         part = movies.first_frames(movie, frames, work / "part.tif")
-        by_frames[frames] = [measured_run(part, work / "run", size, cores) for _ in range(size.repeats)]
+        by_frames[frames] = [measured_run(part, work / "run", size, cores) for _ in range(size.long_repeats)]
         part.unlink()
     movie.unlink()
     by_frames[size.frames] = by_workers[cores]
@@ -94,7 +94,7 @@ class _Memory:
     def _watch(self) -> None:
         while not self._ended.wait(_POLL_S):
             try:
-                for child in psutil.Process(self._pid).children():
+                for child in psutil.Process(self._pid).children(recursive=True):
                     memory = child.memory_info()
                     self._peak = max(self._peak, memory.rss - getattr(memory, "shared", 0))
             except psutil.NoSuchProcess:

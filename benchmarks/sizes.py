@@ -17,6 +17,8 @@ class Size:
         ``full`` or ``small``.
     repeats
         Measurements of each figure; they alternate between what is compared.
+    long_repeats
+        The same, of stages and whole runs.
     windows
         Windows that a fast fitter gets in one measurement; a slow one gets a share of them.
     sides
@@ -43,6 +45,7 @@ class Size:
 
     name: str
     repeats: int
+    long_repeats: int
     windows: int
     sides: tuple[int, ...]
     field: int
@@ -65,6 +68,7 @@ class Size:
 FULL = Size(
     name="full",
     repeats=3,
+    long_repeats=1,
     windows=5000,
     sides=(15, 21, 25, 31, 41, 51, 71),
     field=2048,
@@ -82,6 +86,7 @@ FULL = Size(
 SMALL = Size(
     name="small",
     repeats=1,
+    long_repeats=1,
     windows=300,
     sides=(15, 25),
     field=512,

@@ -43,7 +43,7 @@ def run(size: Size, work: Path) -> dict[str, Any]:
     with connect(ClusterSettings(workers=workers)) as client:
         with finished_run(warm, output, settings, client):
             pass  # compiles the kernels, or loads them
-        for _ in range(size.repeats):
+        for _ in range(size.long_repeats):
             with finished_run(movie, output, settings, client) as outcome:
                 for name, seconds in (outcome.seconds | bare_loops(client, movie, outcome.outputs, work)).items():
                     times.setdefault(name, []).append(seconds)
@@ -131,7 +131,7 @@ def fit_sweep(
     times: dict[int, list[float]] = {count: [] for count in counts}
     for count, table in tables.items():
         write_table(places[np.linspace(0, len(places) - 1, count).astype(int)], table)
-    for _ in range(size.repeats):
+    for _ in range(size.long_repeats):
         for count, table in tables.items():
             columns = ColumnSettings(method="csv", csv=str(table))
             stores.remove(outputs.results)
