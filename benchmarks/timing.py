@@ -8,20 +8,11 @@ from statistics import median
 from time import perf_counter
 from typing import Any, TypeVar
 
+from tract_dask.forkserver import THREAD_VARIABLES
+
 Name = TypeVar("Name", bound=Hashable)
 
-ONE_THREAD = dict.fromkeys(
-    (
-        "NUMBA_NUM_THREADS",
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "RAYON_NUM_THREADS",
-        "BLOSC_NTHREADS",
-        "ZARR_THREADING__MAX_WORKERS",
-    ),
-    "1",
-)
+ONE_THREAD = dict.fromkeys(THREAD_VARIABLES, "1")
 """Environment of every process that is measured on one core."""
 
 
