@@ -61,8 +61,8 @@ PEERS = (
     Fitter("trackpy", "centroid", same_task=False),
 )
 
-_FEWEST = 9
-"""Windows that every fitter gets at least."""
+_FEWEST, _WARM = 9, 2
+"""Windows that every fitter gets at least, and before its time is taken."""
 
 
 class Process:
@@ -124,13 +124,17 @@ def measure(
     counts = {
         fitter: min(len(windows.counts), max(_FEWEST, round(fitter.share * len(windows.counts)))) for fitter in fitters
     }
-    scores = {}
+    scores: dict[Fitter, dict[str, Any]] = {}
+
+    def fit(fitter: Fitter) -> float:
+        process = running[fitter.peer]
+        seconds = process.fit(fitter.method, task, counts[fitter])
+        scores[fitter] = process.found(windows)
+        return seconds
+
     for fitter in fitters:
-        running[fitter.peer].fit(fitter.method, task, _FEWEST)
-        running[fitter.peer].fit(fitter.method, task, counts[fitter])
-        scores[fitter] = running[fitter.peer].found(windows)
-    work = {f: partial(running[f.peer].fit, f.method, task, counts[f]) for f in fitters}
-    times = alternate(work, repeats)
+        running[fitter.peer].fit(fitter.method, task, _WARM)
+    times = alternate({fitter: partial(fit, fitter) for fitter in fitters}, repeats)
     return [
         {"fitter": fitter.name, "same_task": fitter.same_task}
         | {"seconds_per_fit": summary(times[fitter], scores[fitter]["windows"])}

@@ -35,7 +35,7 @@ class Goal:
         From the section's results to the figure, or to several of which all have to reach the goal; none where what it
         is compared with was not measured.
     limit, unit
-        The goal.
+        The goal; None for a figure that only stands beside others.
     at_least
         Whether more is better.
     """
@@ -44,16 +44,18 @@ class Goal:
     what: str
     against: str
     value: Callable[[Results], Sequence[float]]
-    limit: float
+    limit: float | None
     unit: str
     at_least: bool = False
 
     def row(self, results: Results) -> list[str]:
-        """Return the cells of the row."""
+        """Return the cells of the row; none for a figure without a goal that was not measured."""
         found = sorted(self.value(results))
+        shown = " to ".join(dict.fromkeys(f"{figure(value)}{self.unit}" for value in (found[:1] + found[-1:])))
+        if self.limit is None:
+            return [self.what, self.against, shown, "", ""] if found else []
         sign = "≥" if self.at_least else "≤"
         reached = bool(found) and (found[0] >= self.limit if self.at_least else found[-1] <= self.limit)
-        shown = " to ".join(dict.fromkeys(f"{figure(value)}{self.unit}" for value in (found[:1] + found[-1:])))
         verdict = ("yes" if reached else "**no**") if found else "not compared"
         return [self.what, self.against, shown, f"{sign} {self.limit:g}{self.unit}", verdict]
 
@@ -91,10 +93,17 @@ def _scaling(results: Results) -> list[float]:
     return [times["1"] / times[str(results["workers"])]]
 
 
+def _scaling_of_cores(results: Results) -> list[float]:
+    if not results.get("on_one_core"):
+        return []
+    spread = results["by_workers"][str(results["workers"])]
+    return [results["on_one_core"]["seconds"]["median"] / spread["seconds"]["median"]]
+
+
 def _memory_growth(results: Results) -> list[float]:
     peaks = {frames: outcome["worker_peak_mb"]["median"] for frames, outcome in results["by_frames"].items()}
-    whole, quarter = peaks[str(results["frames"])], peaks[str(results["frames"] // QUARTER)]
-    return [100 * abs(whole / quarter - 1)]
+    whole, quarter = peaks[str(results["frames"])], peaks.get(str(results["frames"] // QUARTER))
+    return [100 * abs(whole / quarter - 1)] if quarter else []
 
 
 def _cost_of_a_shard(results: Results) -> list[float]:
@@ -106,7 +115,7 @@ def _driver_growth(results: Results) -> list[float]:
 
 
 def _startup(name: str) -> Callable[[Results], list[float]]:
-    return lambda results: [results[name]["median"]]
+    return lambda results: [results[name]["median"]] if name in results else []
 
 
 _CASES = "kernel, 25 x 25 and 51 x 51, peaks of 20 on 20 and 300 on 300, one core"
@@ -174,6 +183,15 @@ GOALS = (
     ),
     Goal("runs", "whole `run`, input", "", _throughput, 200, " MB/s", at_least=True),
     Goal("runs", "whole `run`, a worker a core", "one worker", _scaling, 1.8, " x faster", at_least=True),
+    Goal(
+        "runs",
+        "the same",
+        "one worker, with its driver and all threads on one core",
+        _scaling_of_cores,
+        None,
+        " x faster",
+        at_least=True,
+    ),
     Goal("runs", "peak memory of a worker, whole movie", "a quarter of the movie", _memory_growth, 10, " % apart"),
     Goal("scheduler", "driver and scheduler, empty shards", "", _cost_of_a_shard, 1, " ms a shard"),
     Goal("scheduler", "growth of the driver's memory meanwhile", "", _driver_growth, 50, " MB"),
@@ -222,7 +240,7 @@ def _versions(packages: Mapping[str, str]) -> str:
 def goals(sections: Mapping[str, Any]) -> str:
     """Return the table of goals."""
     rows = [goal.row(sections[goal.section]) for goal in GOALS if goal.section in sections]
-    return table(["what", "against", "measured", "goal", "reached"], rows)
+    return table(["what", "against", "measured", "goal", "reached"], list(filter(None, rows)))
 
 
 def fitters(results: Results) -> str:
@@ -264,6 +282,9 @@ def _run_rows(results: Results) -> Iterator[list[str]]:
     by_frames = {int(frames): outcome for frames, outcome in results["by_frames"].items()}
     named = [(f"{n} frames, {results['workers']} workers", n, by_frames[n]) for n in sorted(by_frames)]
     named.append((f"{results['frames']} frames, 1 worker", results["frames"], results["by_workers"]["1"]))
+    if results.get("on_one_core"):
+        name = f"{results['frames']} frames, 1 worker, all on one core"
+        named.append((name, results["frames"], results["on_one_core"]))
     for name, frames, outcome in named:
         seconds = outcome["seconds"]
         mb = results["input_mb"] * frames / results["frames"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -21,13 +22,20 @@ _POLL_S = 0.05
 
 
 def run(size: Size, work: Path) -> dict[str, Any]:
-    """Return times and memory of runs on one worker and on one a core, and on movies that are shorter."""
+    """Return times and memory of runs on one worker and on one a core, and on movies that are shorter.
+
+    One worker is measured twice: with all cores for its driver, its reading thread and the disk, and, where processes
+    can be pinned, with everything on one core.
+    """
     cores = psutil.cpu_count() or 1
     movie = movies.simulate(work / "run.tif", size, size.frames)
     by_workers: dict[int, list[dict[str, Any]]] = {cores: [], 1: []}
+    on_one_core: list[dict[str, Any]] = []
     for _ in range(size.long_repeats):
         for workers, outcomes in by_workers.items():
             outcomes.append(measured_run(movie, work / "run", size, workers))
+        if size.one_core and hasattr(os, "sched_setaffinity"):
+            on_one_core.append(measured_run(movie, work / "run", size, 1, one_core=True))
     by_frames: dict[int, list[dict[str, Any]]] = {}
     for share in size.shares:
         frames = size.frames // share
@@ -43,17 +51,27 @@ def run(size: Size, work: Path) -> dict[str, Any]:
         "shard_mb": size.shard_mb,
         "columns": by_workers[cores][0]["columns"],
         "by_workers": {str(workers): _summary(outcomes) for workers, outcomes in by_workers.items()},
+        "on_one_core": _summary(on_one_core) if on_one_core else None,
         "by_frames": {str(frames): _summary(outcomes) for frames, outcomes in by_frames.items()},
     }
 
 
-def measured_run(movie: Path, output: Path, size: Size, workers: int) -> dict[str, Any]:
-    """Run ``tract-dask run`` in a process of its own; return its time, its stages' times and its workers' memory."""
+def measured_run(movie: Path, output: Path, size: Size, workers: int, *, one_core: bool = False) -> dict[str, Any]:
+    """Run ``tract-dask run`` in a process of its own; return its time, its stages' times and its workers' memory.
+
+    ``one_core`` pins it and all that it starts to one core.
+    """
     command = [str(Path(sys.executable).with_name("tract-dask")), "run", str(movie), str(output)]
     command += ["--workers", str(workers), "--window-px", str(size.window_px), "--shard-mb", str(size.shard_mb)]
+
+    def pin() -> None:
+        os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+
     try:
         began = perf_counter()
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        with subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=pin if one_core else None
+        ) as process:
             memory = _Memory(process.pid)
             _, errors = process.communicate()
             seconds = perf_counter() - began

@@ -32,13 +32,18 @@ class Size:
     frames, stage_frames
         Of the whole run, and of the run whose stages are compared with bare loops.
     shares
-        Parts of that movie that are run as well, as divisors of its length; memory is compared with a quarter.
+        Parts of that movie that are run as well, as divisors of its length; memory is compared with a quarter, where
+        that is among them.
+    one_core
+        Whether a run with everything on one core is measured too.
     sweep_columns
         Numbers of columns that the fit stage is measured with.
     shard_mb
         Size of a shard in whole runs, the same for movies of any length.
     shards
         Empty shards for the scheduler.
+    cold
+        Whether the first fit is measured without compiled kernels too.
     peers
         Whom to compare with; of the others, installing them takes longer than the small benchmark.
     """
@@ -54,9 +59,11 @@ class Size:
     frames: int
     stage_frames: int
     shares: tuple[int, ...]
+    one_core: bool
     sweep_columns: tuple[int, ...]
     shard_mb: float
     shards: int
+    cold: bool
     peers: tuple[str, ...]
 
     @property
@@ -77,9 +84,11 @@ FULL = Size(
     frames=956,
     stage_frames=512,
     shares=(8, QUARTER, 2),
+    one_core=True,
     sweep_columns=(25, 100, 200),
     shard_mb=256.0,
     shards=100_000,
+    cold=True,
     peers=("picasso", "scipy", "lmfit", "atomap", "trackpy"),
 )
 
@@ -87,16 +96,18 @@ SMALL = Size(
     name="small",
     repeats=1,
     long_repeats=1,
-    windows=300,
-    sides=(15, 25),
-    field=512,
+    windows=40,
+    sides=(15,),
+    field=256,
     pixel_size_pm=6.0,
     window_px=25,
-    frames=64,
-    stage_frames=32,
-    shares=(QUARTER,),
-    sweep_columns=(5, 20),
-    shard_mb=2.0,
-    shards=500,
-    peers=("scipy", "lmfit", "trackpy"),
+    frames=16,
+    stage_frames=16,
+    shares=(),
+    one_core=False,
+    sweep_columns=(5,),
+    shard_mb=1.0,
+    shards=100,
+    cold=False,
+    peers=("scipy", "lmfit"),
 )

@@ -43,19 +43,18 @@ def run(size: Size, work: Path) -> dict[str, Any]:
     with connect(ClusterSettings(workers=workers)) as client:
         with finished_run(warm, output, settings, client):
             pass  # compiles the kernels, or loads them
-        for _ in range(size.long_repeats):
+        for last in (*[False] * (size.long_repeats - 1), True):
             with finished_run(movie, output, settings, client) as outcome:
                 for name, seconds in (outcome.seconds | bare_loops(client, movie, outcome.outputs, work)).items():
                     times.setdefault(name, []).append(seconds)
-                found = outcome.columns
-        with finished_run(movie, output, settings, client) as outcome:
-            sweep = fit_sweep(size, movie, outcome.outputs, settings, client)
+                if last:
+                    sweep = fit_sweep(size, movie, outcome.outputs, settings, client)
     movie.unlink()
     warm.unlink()
     return {
         "workers": workers,
         "frames": size.stage_frames,
-        "columns": found,
+        "columns": outcome.columns,
         "window_px": size.window_px,
         "input_mb": size.stage_frames * size.frame_bytes / 1e6,
         "seconds": {name: summary(values) for name, values in times.items()},

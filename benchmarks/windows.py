@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tract_dask.kernels.gaussian import evaluate
+from tract_dask.kernels.information import column_bounds
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +25,6 @@ LOST_PX = 3.0
 """A fit that is farther than this from the truth, on either axis, has failed."""
 
 _CHUNK = 200
-_PARAMETERS = 7
 
 
 @dataclass(frozen=True)
@@ -88,29 +88,8 @@ def draw(case: Case, n: int, seed: int = 0) -> Windows:
     for first in range(0, n, _CHUNK):
         part = slice(first, first + _CHUNK)
         counts[part] = rng.poisson(evaluate(truth[part], x, y))
-        crlb[part] = position_bounds(truth[part], case.side)
+        crlb[part] = np.transpose(column_bounds(truth[part], case.side)[:2])
     return Windows(case, counts, truth, crlb, *_guesses(case, counts))
-
-
-def position_bounds(parameters: Floats, side: int) -> Floats:
-    """Return the Cramér-Rao bounds (n, 2) of the variances of x and y for Poisson counts, from (n, 7) parameters.
-
-    They are diagonal elements of the inverse of the Fisher information, the sum over the pixels of the products of the
-    model's derivatives divided by the model. The derivatives are central differences of Equation 1, whose error,
-    1e-9 or so, is nothing here.
-    """
-    y, x = np.mgrid[:side, :side]
-    model = evaluate(parameters, x, y).reshape(len(parameters), -1)
-    slopes = np.empty((*model.shape, _PARAMETERS))
-    for number in range(_PARAMETERS):
-        step = np.zeros(_PARAMETERS)
-        step[number] = 1e-4
-        change = evaluate(parameters + step, x, y) - evaluate(parameters - step, x, y)
-        slopes[..., number] = change.reshape(model.shape) / 2e-4
-    slopes /= np.sqrt(model)[..., None]
-    information = np.einsum("npi,npj->nij", slopes, slopes)
-    bounds: Floats = np.linalg.inv(information)[:, [1, 2], [1, 2]]
-    return bounds
 
 
 def score(centres: Floats, fine: NDArray[np.bool_], windows: Windows) -> dict[str, float | None]:

@@ -1,8 +1,6 @@
 """The benchmark: its windows and scores against theory, and the whole of it on small data, peers included."""
 
 import json
-import math
-import os
 import subprocess
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from benchmarks.__main__ import DOCUMENT, FIGURES, SECTIONS
 from benchmarks.fitters import LSQ, POISSON
 from benchmarks.peers.protocol import equation_1, slopes_1
 from benchmarks.sizes import SMALL
-from benchmarks.windows import Case, draw, position_bounds, score
+from benchmarks.windows import Case, draw, score
 from tract_dask.kernels.gaussian import evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -31,13 +29,6 @@ def test_derivatives_that_scipy_gets():
     x, y = np.array([3.0, 11.0, 20.0]), np.array([15.0, 12.0, 8.0])
     numerical = approx_fprime(PARAMETERS, lambda p: equation_1(p, x, y), 1e-6)
     np.testing.assert_allclose(slopes_1(PARAMETERS, x, y), numerical, rtol=1e-4, atol=1e-4)
-
-
-def test_cramer_rao_bound_of_a_faint_round_column_is_the_closed_form():
-    # Far below the background, and far from the edges: var(x) = 2 B / (pi A^2), whatever sigma is.
-    peak, background, sigma = 0.01, 20.0, 4.0
-    found = position_bounds(np.array([[peak, 25.0, 25.0, sigma, 1.001 * sigma, 0.3, background]]), 51)
-    np.testing.assert_allclose(found, 2 * background / (math.pi * peak**2), rtol=2e-3)
 
 
 def test_scores_of_fits_whose_errors_are_known():
@@ -80,8 +71,7 @@ def results(tmp_path_factory):
     """The small benchmark, run by its one command; peers are installed where they are missing."""
     out = tmp_path_factory.mktemp("bench")
     command = [ROOT / "scripts" / "bench", "--small", "--out", out, "--work", out]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE")}
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=900, env=environment)
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-5000:]
     kept = json.loads((out / "results.json").read_text(encoding="utf-8"))
     assert (out / "results.md").read_text(encoding="utf-8") in done.stdout
@@ -112,25 +102,25 @@ def test_every_fitter_recovers_the_truth(results):
 def test_stages_and_runs_were_measured(results):
     sections = results["sections"]
     stages, runs = sections["stages"], sections["runs"]
-    assert stages["columns"] > 30
+    assert stages["columns"] > 10
     assert {"convert", "drift", "sum", "fit", "bare convert", "bare fit", "dask to_zarr"} < stages["seconds"].keys()
     assert len(stages["fit_by_columns"]) == 1 + len(SMALL.sweep_columns)
     assert runs["by_workers"].keys() == {"1", str(runs["workers"])}
-    assert runs["by_frames"].keys() == {str(SMALL.frames), str(SMALL.frames // 4)}
+    assert runs["by_frames"].keys() == {str(SMALL.frames)}
     for outcome in (*runs["by_workers"].values(), *runs["by_frames"].values()):
         assert 50 < outcome["worker_peak_mb"]["median"] < 2000
         assert sum(times["median"] for times in outcome["stages"].values()) < outcome["seconds"]["median"]
     assert sections["scheduler"]["shards"] == SMALL.shards
-    assert (
-        sections["startup"]["first fit, warm cache"]["median"] < sections["startup"]["first fit, cold cache"]["median"]
-    )
+    startup = sections["startup"]
+    assert startup["import tract_dask"]["median"] < startup["first fit, warm cache"]["median"]
 
 
 @pytest.mark.slow
 def test_every_goal_has_its_row(results):
     rows = report.goals(results["sections"]).splitlines()[2:]
-    assert len(rows) == len(report.GOALS)
-    assert sum("not compared" in row for row in rows) == 2, "picasso is not in the small benchmark"
+    assert len(rows) == sum(goal.limit is not None for goal in report.GOALS)
+    missing = "picasso (2), a quarter of the movie and cold starts are not in the small benchmark"
+    assert sum("not compared" in row for row in rows) == 4, missing
 
 
 def test_the_document_shows_the_published_figures():

@@ -160,3 +160,13 @@ def test_lazy_client_connects_once_and_only_when_asked():
     assert lazy() is client
     assert asked == [client]
     lazy.close()
+
+
+def test_workers_that_cannot_start_are_told_with_what_a_script_needs(monkeypatch):
+    def refuse(**kwargs):
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr("tract_dask.cluster.LocalCluster", refuse)
+    told = r"(?s)Nanny failed to start.*if __name__ == \"__main__\":"
+    with pytest.raises(ClusterError, match=told), cluster.connect(ClusterSettings(workers=1)):
+        pass

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib
 import os
 import re
 import signal
@@ -86,8 +87,7 @@ def test_commands_and_examples_of_the_readme(folder):
     for name in re.findall(r"^\| (`.*?`) \|", text, flags=re.MULTILINE):
         for path in re.findall(r"`(.*?)`", name):
             assert (folder / "out" / path).exists(), path
-    for block in blocks("README.md", "python"):
-        call(sys.executable, "-c", block, folder=folder)
+    call(sys.executable, "-c", "\n".join(blocks("README.md", "python")), folder=folder)
 
 
 @pytest.mark.slow
@@ -95,6 +95,47 @@ def test_commands_of_the_cluster_recipe(folder):
     for block in blocks("docs/cluster.md", "bash"):
         call("bash", "-euo", "pipefail", "-c", block, folder=folder)
     assert (folder / "out-cluster" / "results.zarr").is_dir()
+
+
+@pytest.mark.slow
+def test_examples_of_the_analysis(folder):
+    for block in blocks("docs/analysis.md", "bash"):
+        call("bash", "-euo", "pipefail", "-c", block, folder=folder)
+    call(sys.executable, "-c", "\n".join(blocks("docs/analysis.md", "python")), folder=folder)
+
+
+def test_notebook_is_made_from_the_tutorial():
+    made = call(sys.executable, str(ROOT / "scripts" / "make_notebook"), folder=ROOT)
+    assert (ROOT / "docs" / "notebooks" / "paper.ipynb").read_text(encoding="utf-8") == made, (
+        "run scripts/make_notebook > docs/notebooks/paper.ipynb"
+    )
+
+
+@pytest.mark.slow
+def test_the_tutorial_runs_makes_its_figures_and_finds_the_truth(tmp_path):
+    said = call(sys.executable, str(ROOT / "scripts" / "make_notebook"), "--figures", str(tmp_path), folder=tmp_path)
+    shown = re.findall(r"\(images/tutorial/(.*?)\)", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"))
+    assert sorted(shown) == sorted(file.name for file in tmp_path.glob("*.png"))
+    absent = re.search(r"^absent: (.*)$", said, re.MULTILINE)[1]
+    assert re.search(r"^not accepted: (.*)$", said, re.MULTILINE)[1] == absent
+    jumping, frames = re.search(r"^column (\d+) jumps at frames \[(.*)\]$", said, re.MULTILINE).groups()
+    assert f"the Wiener filter moved column {jumping}" in said
+    found = re.findall(rf"^\d+ +{jumping} +(\d+) ", said.partition("p_value\njump")[2], re.MULTILINE)
+    assert found == frames.split()
+    assert int(re.search(r"^right: (\d+)%", said, re.MULTILINE)[1]) >= 85
+
+
+def test_names_that_the_tutorial_links_to_the_paper_exist():
+    table = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").partition("## From the paper to the code")[2]
+    rooms = {"plots", "simulate", "settings", "measure", "export"}
+    analyses = {"motion", "jumps", "precision", "intensity", "occupancy", "presence"}
+    names = re.findall(r"`([a-z]+)\.(\w+)`", table)
+    assert {room for room, _ in names} >= analyses
+    for room, name in names:
+        if name != "py":
+            assert room in rooms | analyses, room
+            module = importlib.import_module(f"tract_dask.{'' if room in rooms else 'analysis.'}{room}")
+            assert hasattr(module, name), f"{room}.{name}"
 
 
 def test_links_lead_somewhere():

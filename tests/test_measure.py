@@ -49,6 +49,48 @@ def test_positions_and_shapes_match_the_truth(scene, make_movie):
     assert (tracks.status == 0).mean() > 0.99
 
 
+def test_centroids_are_nearly_as_good_as_fits(scene, make_movie):
+    """Drift-corrected, unbiased, and at most 1.3 times the bound: a mask of the best radius loses 13 % at least."""
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), refine_columns=None
+    ).compute()
+    away = tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place
+    assert away.std() <= 1.3 * position_bound(scene)
+    assert np.abs(away.mean(axis=0)).max() <= 4 * position_bound(scene) / np.sqrt(scene.n_frames)
+    assert away.std() >= (tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place).std()
+
+
+def test_centroids_are_not_masked_but_where_there_is_no_window_or_frame(scene, make_movie):
+    scene.drift[5] = (0, -18)
+    frames = scene.counts().astype(np.float32)
+    frames[7, 0, 0] = np.nan
+    tracks = fit_columns(
+        make_movie(frames), scene.columns(), scene.drift_dataset(), FitSettings(threshold=100), refine_columns=None
+    ).compute()
+    masked = accepted(tracks)
+    assert masked.fit.isnull().all()
+    lost = (tracks.status.to_numpy() & (Status.OUTSIDE_FRAME | Status.BAD_FRAME)) > 0
+    assert lost[5].any()
+    assert lost[7].all()
+    np.testing.assert_array_equal(masked.centroid.isnull().any("axis"), lost)
+
+
+def test_dark_columns_have_centroids(scene, make_movie):
+    scene.amplitude, scene.background = -60.0, 100.0
+    tracks = fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset()).compute()
+    assert (tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place).std() <= 0.3
+
+
+def test_a_small_mask_is_noisier(scene, make_movie):
+    movie = make_movie(scene.counts())
+    spread = {}
+    for radius in (None, 3.0):
+        settings = FitSettings(mask_radius_px=radius)
+        tracks = fit_columns(movie, scene.columns(), scene.drift_dataset(), settings, refine_columns=None).compute()
+        spread[radius] = (tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place).std()
+    assert spread[3.0] > 1.3 * spread[None]
+
+
 def test_positions_do_not_depend_on_the_drift(scene, make_movie):
     """Windows move with the drift: a still scene and a drifting one give the same positions, noise-free, to 1e-3 px."""
     scene.drift = scene.drift + 0.37

@@ -190,6 +190,8 @@ def test_lazy_frames(tmp_path, source, counts):
     part = frames[4:9, 10:20, ::3]
     np.testing.assert_array_equal(part.compute(scheduler="synchronous"), counts[4:9, 10:20, ::3])
     np.testing.assert_array_equal(frames[5].compute(scheduler="threads"), counts[5])
+    for odd in ((slice(20, 2, -5), 7, slice(-9, None)), (slice(3, 3), slice(None), -1), ([6, 2], 3, slice(90, 5, -7))):
+        np.testing.assert_array_equal(frames.data[odd].compute(scheduler="synchronous"), counts[odd])
 
 
 def test_tiles_hold_every_pixel_of_a_shard_once(tmp_path, source, counts):

@@ -6,8 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import xarray as xr
+from conftest import Scene
 
 from tract_dask import pipeline
 from tract_dask.cluster import connect
@@ -19,11 +21,23 @@ ROOT = Path(__file__).parent.parent
 SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1), cluster=ClusterSettings(workers=2))
 
 
-@pytest.fixture
-def movie(scene, npy) -> Path:
-    scene.n_frames = 48
-    scene.__post_init__()
-    return npy(scene.counts())
+@pytest.fixture(scope="module")
+def movie(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("resume") / "movie.npy"
+    np.save(path, Scene(n_frames=48).counts())
+    return path
+
+
+@pytest.fixture(scope="module")
+def client():
+    with connect(SETTINGS.cluster) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def whole(movie, client) -> pipeline.RunOutcome:
+    """What an uninterrupted run gives."""
+    return pipeline.run(movie, movie.with_name("whole"), SETTINGS, client=client)
 
 
 def test_killed_runs_end_as_an_uninterrupted_one(movie, tmp_path):
@@ -48,7 +62,7 @@ def test_killed_runs_end_as_an_uninterrupted_one(movie, tmp_path):
     assert "1 of 1 identical" in found.stdout
 
 
-def test_killed_worker_is_replaced_and_nothing_is_lost(movie, tmp_path):
+def test_killed_worker_is_replaced_and_nothing_is_lost(movie, client, whole, tmp_path):
     killed = []
 
     def kill_once_in_a_stage(event):
@@ -57,15 +71,13 @@ def test_killed_worker_is_replaced_and_nothing_is_lost(movie, tmp_path):
             pid = min(client.run(os.getpid).values())
             os.kill(pid, signal.SIGKILL)
 
-    with connect(SETTINGS.cluster) as client:
-        whole = pipeline.run(movie, tmp_path / "whole", SETTINGS, client=client)
-        hurt = pipeline.run(movie, tmp_path / "hurt", SETTINGS, client=client, on_event=kill_once_in_a_stage)
+    hurt = pipeline.run(movie, tmp_path / "hurt", SETTINGS, client=client, on_event=kill_once_in_a_stage)
     assert killed == ["convert", "fit"]
     assert hurt.fits == whole.fits
     xr.testing.assert_equal(open_results(whole.outputs.results).load(), open_results(hurt.outputs.results).load())
 
 
-def test_scheduler_and_workers_started_by_hand_give_the_same_results(movie, tmp_path):
+def test_scheduler_and_workers_started_by_hand_give_the_same_results(movie, whole, tmp_path):
     file = tmp_path / "scheduler.json"
     options = ["--scheduler-file", str(file), "--no-dashboard"]
     commands = [["scheduler", "--port", "0", *options]] + 2 * [
@@ -85,6 +97,4 @@ def test_scheduler_and_workers_started_by_hand_give_the_same_results(movie, tmp_
         for process in processes:
             process.kill()
             process.wait()
-    with connect(ClusterSettings(workers=1)) as client:
-        local = pipeline.run(movie, tmp_path / "near", SETTINGS, client=client)
-    xr.testing.assert_equal(open_results(spread.outputs.results).load(), open_results(local.outputs.results).load())
+    xr.testing.assert_equal(open_results(spread.outputs.results).load(), open_results(whole.outputs.results).load())

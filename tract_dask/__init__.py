@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .columns import find_columns, lattice_columns
+    from .comparison import compare_filters
     from .conversion import convert
+    from .detection import detect_columns, link_detections
+    from .dose import fit_doses, rebin_frames
     from .drift import estimate_drift
+    from .filtering import filter_frames
     from .fit import fit_columns
     from .io import open_source
     from .movie import open_movie
@@ -30,7 +34,13 @@ _ROOMS = {
     "sum_image": "summing",
     "find_columns": "columns",
     "lattice_columns": "columns",
+    "detect_columns": "detection",
+    "link_detections": "detection",
     "fit_columns": "fit",
+    "filter_frames": "filtering",
+    "compare_filters": "comparison",
+    "rebin_frames": "dose",
+    "fit_doses": "dose",
     "run": "pipeline",
     "open_results": "results",
     "accepted": "results",
@@ -39,14 +49,20 @@ _ROOMS = {
 
 __all__ = [
     "accepted",
+    "compare_filters",
     "convert",
+    "detect_columns",
     "estimate_drift",
+    "filter_frames",
     "find_columns",
     "fit_columns",
+    "fit_doses",
     "lattice_columns",
+    "link_detections",
     "open_movie",
     "open_results",
     "open_source",
+    "rebin_frames",
     "run",
     "simulate_movie",
     "sum_image",

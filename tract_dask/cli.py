@@ -5,23 +5,26 @@ Heavy modules are imported inside the commands, so that help comes at once.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
+import os
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
 from .errors import TractError
-from .options import Command, setting_options
+from .options import Command, class_options, numbers, setting_options
 from .settings import RunSettings
+from .simulate.settings import PRESETS, Microscope, SpecimenSettings
 
 if TYPE_CHECKING:
     from .pipeline import Plan, RunOutcome
@@ -70,6 +73,12 @@ class Group(click.Group):
         ctx.exit(code)
 
 
+class Subgroup(click.Group):
+    """Commands of one subject."""
+
+    command_class = Command
+
+
 def common_options(function: F) -> F:
     """Give a command ``--json`` and ``--debug``."""
     debug = click.option(
@@ -86,6 +95,10 @@ def common_options(function: F) -> F:
 overwrite_option = click.option("--overwrite", is_flag=True, help="Begin anew, whatever is there.")
 drift_option = click.option("--drift-from", type=PATH, help="The drift, as tract-dask drift wrote it; otherwise none.")
 
+pixel_option = click.option("--pixel-size-pm", default=4.0, show_default=True, metavar="PM", help="Size of a pixel.")
+specimen_options = class_options(SpecimenSettings, "specimen", "Specimen")
+microscope_options = class_options(Microscope, "microscope", "Microscope", presets=PRESETS)
+
 
 @click.group(name="tract", cls=Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="tract_dask", prog_name="tract-dask")
@@ -100,17 +113,18 @@ def main() -> None:
 @click.argument("source")
 @click.argument("output", type=PATH)
 @click.option("--plan", "plan_only", is_flag=True, help="Print what would be done, and stop.")
+@click.option("--report/--no-report", default=True, help="Write report.html at the end [on].")
 @overwrite_option
 @common_options
 @setting_options("source", "metadata", "convert", "drift", "columns", "fit", "cluster")
-def run(source: str, output: Path, settings: RunSettings, *, plan_only: bool, overwrite: bool, as_json: bool) -> None:
+def run(source: str, output: Path, settings: RunSettings, *, as_json: bool, **options: bool) -> None:
     """Turn the movie SOURCE into tracks in the folder OUTPUT.
 
     Run it again to go on where it was stopped; changed settings redo only what they affect.
     """
     pipeline = _pipeline(settings)
     with _progress() as on_event:
-        outcome = pipeline.run(source, output, settings, on_event=on_event, overwrite=overwrite, plan_only=plan_only)
+        outcome = pipeline.run(source, output, settings, on_event=on_event, **options)
     _show_outcome(outcome, as_json=as_json)
 
 
@@ -196,6 +210,42 @@ def fit(
     _exit_for(summary.bad_frames)
 
 
+@main.command("compare-filters")
+@click.argument("source")
+@click.argument("output", type=PATH)
+@click.option("--frames", type=numbers, default="0", metavar="N,N,...", help="Numbers of the frames [0].")
+@click.option("--column-ids", type=numbers, metavar="N,N,...", help="IDs of the columns; unset: all of them.")
+@common_options
+@setting_options("source", "metadata", "convert", "drift", "columns", "fit", "cluster")
+def compare_filters(
+    source: str,
+    output: Path,
+    settings: RunSettings,
+    *,
+    frames: tuple[int, ...],
+    column_ids: tuple[int, ...] | None,
+    as_json: bool,
+) -> None:
+    """Show what each filter does to positions and intensities, as a table and a figure in the folder OUTPUT.
+
+    SOURCE is the folder of a run; or a movie, which is then run into OUTPUT first.
+    """
+    from . import comparison
+
+    run_folder = Path(source)
+    if not (run_folder / "movie.zarr").is_dir():
+        run_folder = output
+        with _progress() as on_event:
+            _pipeline(settings).run(source, output, settings, on_event=on_event)
+    compared, warnings = comparison.compare_in_run(run_folder, output, frames, column_ids, settings.fit)
+    if as_json:
+        click.echo(json.dumps({"rows": list(comparison.table_rows(compared)), "warnings": warnings}))
+    else:
+        click.echo(comparison.table_text(compared))
+    for warning in warnings:
+        click.echo(f"Warning: {warning}.", err=True)
+
+
 @main.command()
 @click.argument("folder", type=PATH, default="tract-dask-demo")
 @click.option("--frames", default=60, show_default=True, help="Frames of the simulated movie.")
@@ -211,6 +261,169 @@ def demo(folder: Path, settings: RunSettings, *, frames: int, as_json: bool) -> 
     with _progress() as on_event:
         found = run_demo(folder, frames, settings, on_event=on_event)
     _show(found, as_json=as_json)
+
+
+@main.command()
+@click.argument("folder", type=PATH, metavar="OUTPUT")
+@click.option("--file", type=PATH, help="Where to write the report; otherwise report.html in the folder.")
+@common_options
+def report(folder: Path, file: Path | None, *, as_json: bool) -> None:
+    """Write what the run in the folder OUTPUT measured, and how well, as one HTML file.
+
+    Every run ends with one; this makes it anew. The file needs neither other files nor a network.
+    """
+    from .report import write_report
+
+    written = write_report(folder, file)
+    _show({"wrote": str(written), "bytes": written.stat().st_size}, as_json=as_json)
+
+
+@main.command()
+@click.argument("results", type=PATH)
+@click.argument("file", type=PATH)
+@click.option("--overwrite", is_flag=True, help="Replace the file if it is there.")
+@click.option("--accepted-only", is_flag=True, help="Leave out the fits that are not accepted.")
+@click.option("--atoms", type=PATH, help="For .xyz: a CSV file with column_id, atoms and perhaps frame.")
+@click.option("--spacing-pm", type=float, metavar="PM", help="For .xyz: distance of atoms along the beam.")
+@click.option("--element", default="Ce", show_default=True, metavar="SYMBOL", help="For .xyz: the element.")
+@click.option("--align", default="centre", type=click.Choice(["centre", "face"]), help="For .xyz: [centre].")
+@common_options
+def export(results: Path, file: Path, *, overwrite: bool, accepted_only: bool, as_json: bool, **model: Any) -> None:
+    """Write RESULTS to FILE: .csv, .parquet, .nc, .mat, or .xyz for a model of atoms.
+
+    RESULTS is a results.zarr, or the folder of a run.
+    """
+    from . import export as exporting
+
+    atoms, spacing_pm = model.pop("atoms"), model.pop("spacing_pm")
+    if file.suffix.lower() != ".xyz" and (atoms is not None or spacing_pm is not None):
+        raise click.UsageError("--atoms and --spacing-pm are for a model of atoms (.xyz).")
+    if file.suffix.lower() == ".xyz":
+        if atoms is None or spacing_pm is None:
+            raise click.UsageError("A model of atoms needs --atoms and --spacing-pm.")
+        tracks = exporting.open_tracks(results)
+        counts = exporting.read_atoms(atoms)
+        exporting.to_xyz(tracks, counts, file, spacing_pm=spacing_pm, overwrite=overwrite, **model)
+    else:
+        exporting.export(results, file, accepted_only=accepted_only, overwrite=overwrite)
+    _show({"wrote": str(file), "bytes": file.stat().st_size}, as_json=as_json)
+
+
+@main.command()
+@click.argument("out", type=PATH)
+@click.option("--folder", type=PATH, help='Where to put the figures. ["figures" in OUT].')
+@click.option("--only", metavar="NAME,NAME,...", help="Names of figures; unset: those that need no further fits.")
+@click.option("--table", type=PATH, help="A look-up table (.csv), for numbers of atoms.")
+@click.option(
+    "--format", "suffix", default="png", type=click.Choice(["png", "pdf", "svg"]), help="Of the files. [png]."
+)
+@common_options
+def figures(
+    out: Path, *, folder: Path | None, only: str | None, table: Path | None, suffix: str, as_json: bool
+) -> None:
+    """Draw the figures that the results of a run in the folder OUT allow.
+
+    They are sum, drift, fit, displacement, spread, tracks, jumps, fwhm, intensity, repeated_error and presence; with
+    --table, look_up and occupancy; and precision, intensity_dose and filters, which fit frames again, if --only names
+    them.
+    """
+    from .figures import draw_figures
+
+    names = None if only is None else [name.strip() for name in only.split(",")]
+    drawn = draw_figures(out, folder, names, table=table, suffix=f".{suffix}")
+    found: dict[str, Any] = {"wrote": [str(path) for path in drawn.files.values()]}
+    _show(found | ({"skipped": drawn.skipped} if as_json else {}), as_json=as_json)
+    for name, reason in drawn.skipped.items():
+        click.echo(f"Not drawn: {name}. {reason}", err=True)
+
+
+@main.group(cls=Subgroup)
+def simulate() -> None:
+    """Simulate movies, images and look-up tables with known truth.
+
+    All but the movie of Gaussian columns is multislice, which needs abTEM: pip install "tract_dask[simulate]".
+    """
+
+
+@simulate.command(name="movie")
+@click.argument("output", type=PATH)
+@click.option(
+    "--model",
+    type=click.Choice(("gaussian", "multislice")),
+    default="gaussian",
+    help="Columns as Gaussians, quick and of any length, or images by multislice. [gaussian].",
+)
+@click.option("--frames", default=60, show_default=True, help="Frames of the movie.")
+@pixel_option
+@click.option("--frame-time-s", default=0.1, show_default=True, metavar="S", help="Time from frame to frame.")
+@click.option("--dose", default=500.0, show_default=True, metavar="E/A^2", help="Electron dose of a frame.")
+@click.option("--contrast", type=float, help="Factor on the contrast. [gaussian: 0.5; multislice: 1].")
+@click.option("--drift-px", default=0.3, show_default=True, metavar="PX", help="Step of the random drift, per axis.")
+@click.option("--jump-pm", default=15.0, show_default=True, metavar="PM", help="How far one column jumps (ceo2).")
+@click.option("--seed", default=0, show_default=True, help="The number that fixes all randomness.")
+@common_options
+@specimen_options
+@microscope_options
+def simulate_movie(
+    output: Path, specimen: SpecimenSettings, microscope: Microscope, *, model: str, as_json: bool, **options: Any
+) -> None:
+    """Write a drifting, counted movie to OUTPUT (.tif), and its truth beside it (.zarr)."""
+    from .simulate.files import write_simulated_movie
+
+    written = write_simulated_movie(output, model, specimen, microscope, **options)
+    _show({"wrote": [str(path) for path in written]}, as_json=as_json)
+
+
+@simulate.command(name="image")
+@click.argument("output", type=PATH)
+@pixel_option
+@common_options
+@specimen_options
+@microscope_options
+def simulate_image(
+    output: Path, specimen: SpecimenSettings, microscope: Microscope, *, pixel_size_pm: float, as_json: bool
+) -> None:
+    """Write a noise-free image to OUTPUT (.tif), vacuum = 1.
+
+    Its columns (.csv) and its settings (.toml) go beside it.
+    """
+    from .simulate.files import write_simulated_image
+
+    written = write_simulated_image(output, specimen, microscope, pixel_size_pm)
+    _show({"wrote": [str(path) for path in written]}, as_json=as_json)
+
+
+@simulate.command(name="table")
+@click.argument("output", type=PATH)
+@click.option("--max-atoms", default=12, show_default=True, help="Thickness of the last image, in periods of the beam.")
+@click.option("--kind", default="", metavar="ELEMENT", help="Columns to measure; otherwise the heaviest.")
+@pixel_option
+@common_options
+@class_options(SpecimenSettings, "specimen", "Specimen", without=("n_periods",))
+@microscope_options
+@setting_options("columns.contrast", "fit.window_px", "fit.blur_sigma_px", "fit.estimator", "fit.intensity_scale")
+def simulate_table(
+    output: Path,
+    specimen: SpecimenSettings,
+    microscope: Microscope,
+    settings: RunSettings,
+    *,
+    max_atoms: int,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Write what intensity a column of 1, 2, 3 ... atoms has to OUTPUT (.csv).
+
+    The images (.tif, all columns equally thick) and the settings (.toml) go beside it. Give the pixel size and the fit
+    of the experiment: they change intensities.
+    """
+    from .simulate.files import write_simulated_table
+
+    specimen = dataclasses.replace(specimen, n_periods=max_atoms)
+    options["contrast"] = settings.columns.contrast
+    table, written = write_simulated_table(output, specimen, microscope, settings.fit, **options)
+    found = {str(n): round(float(value), 4) for n, value in table["intensity"].to_series().items()}
+    _show(found | {"wrote": [str(path) for path in written]}, as_json=as_json)
 
 
 def _pipeline(settings: RunSettings) -> ModuleType:
@@ -249,7 +462,8 @@ def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:
             "accepted": f"{outcome.accepted:,}{share}",
         }
         rows |= {"frames not fitted": outcome.bad_frames} if outcome.bad_frames else {}
-        _show(rows | {"wrote": list(outcome.outputs.paths().values())}, as_json=False)
+        written = [path for path in outcome.outputs.paths().values() if Path(path).exists()]
+        _show(rows | {"wrote": written}, as_json=False)
     if outcome.state == "planned":
         outcome.plan.check()
     _exit_for(outcome.bad_frames)
@@ -307,5 +521,22 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def command() -> NoReturn:
+    """Run the command line as a process, and end it at once.
+
+    To take apart all that was imported takes Python a second or more, and nothing depends on it: what was written is on
+    disk, the workers are gone, and their server ends with this process.
+    """
+    code: object = 0
+    try:
+        main()
+    except SystemExit as ended:
+        code = ended.code
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # whoever read it may be gone
+            stream.flush()
+    os._exit(code if isinstance(code, int) else int(code is not None))
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    command()

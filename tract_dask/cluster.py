@@ -187,14 +187,24 @@ def _local(settings: ClusterSettings) -> Iterator[Client]:
     forkserver.start()
     with dask.config.set(changes), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Port .* is already in use")
-        cluster = LocalCluster(
-            n_workers=local_workers(settings),
-            threads_per_worker=1,
-            memory_limit=local_memory_limit(settings),
-            processes=True,
-            dashboard_address="127.0.0.1:8787",
-            silence_logs=logging.CRITICAL,
-        )
+        try:
+            cluster = LocalCluster(
+                n_workers=local_workers(settings),
+                threads_per_worker=1,
+                memory_limit=local_memory_limit(settings),
+                processes=True,
+                dashboard_address="127.0.0.1:8787",
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:
+            raise ClusterError(
+                "the local cluster cannot start its workers",
+                "this machine",
+                f"{local_workers(settings)} worker processes",
+                str(error),
+                'In a script, put what is run under if __name__ == "__main__": since workers import the script; '
+                "otherwise look at what the workers wrote above, and whether the memory limit is too small",
+            ) from error
         with cluster, Client(cluster) as client:
             yield client
 

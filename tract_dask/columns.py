@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from . import schema
+from .detection import METHODS, make_detector
 from .errors import InputError, SettingsError
 from .kernels.filters import cut_windows
 from .kernels.fitting import GaussianFits, fit_gaussians
@@ -83,7 +84,8 @@ def find_columns(
     """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
 
     Seeds come from the image (method ``auto``, see :func:`tract_dask.lattice.find_peaks`), from lattices of three atoms
-    (``lattice``, see :func:`lattice_columns`) or from a file (``csv``). Each moves to the local maximum within the
+    (``lattice``, see :func:`lattice_columns`), from a file (``csv``), or are what stands out of the noise (``maxima``,
+    ``blobs``, ``template``, see :mod:`tract_dask.detection`). Each moves to the local maximum within the
     search radius, then to the centroid around that, and there Equation 1 is fitted.
 
     Parameters
@@ -94,7 +96,9 @@ def find_columns(
         Defaults to automatic columns, bright.
     seeds
         Columns to start from, as :func:`lattice_columns` and :func:`read_columns_csv` return them and as you may have
-        changed them; they take the place of the method, and keep their IDs.
+        changed them; they take the place of the method, and keep their IDs. With a variable ``share``, as
+        :func:`tract_dask.link_detections` leaves it, the amplitude is divided by the share of the frames in which the
+        column is there.
     blur_sigma_px, window_px
         As in the fit of the frames, px. The window's default is half the columns' spacing, odd.
 
@@ -129,6 +133,8 @@ def find_columns(
     inside, corner = _corners(places, window, scene.valid)
     places = np.where(inside[:, None], places, found.places)
     fit, status = _fit(scene, places, corner, inside, found.kind, window, max(search, 1.0))
+    if seeds is not None and "share" in seeds:
+        fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
     fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
     places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], places)
     twins = _twins(places, _SAME * spacing)
@@ -174,6 +180,8 @@ def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) ->
         return _automatic(scene, settings)
     if given is None and settings.method == "lattice":
         return _on_lattices(scene, settings)
+    if given is None and settings.method in METHODS:
+        return _detected(scene, settings)
     where = "seeds"
     if given is None:
         if settings.csv is None:
@@ -199,15 +207,29 @@ def _automatic(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
     spacing = lattice.spacing if lattice else float(settings.spacing_px or 0)
     places = find_peaks(scene.relief(spacing), lattice, spacing, settings.min_amplitude)
     if not len(places):
-        raise InputError(
-            "no column stands out of the noise",
-            "columns",
-            f"columns {'brighter' if scene.sign > 0 else 'darker'} than their surroundings",
-            "none",
-            f"Check the contrast (now {settings.contrast}) and spacing_px, or give the columns in a CSV file",
-        )
+        raise _none_stands_out(scene, settings)
     number = np.arange(1, len(places) + 1)
     return _Seeds(places, np.full(len(places), ""), number, False), neighbour_distance(places) or spacing
+
+
+def _detected(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
+    """Return the seeds that a detector finds, without a lattice."""
+    detector = make_detector(scene.counts, scene.valid, settings, blur_sigma_px=scene.blur_sigma_px)
+    places, _ = detector(scene.counts, scene.valid)
+    if not len(places):
+        raise _none_stands_out(scene, settings)
+    number = np.arange(1, len(places) + 1)
+    return _Seeds(places, np.full(len(places), ""), number, False), detector.spacing_px
+
+
+def _none_stands_out(scene: _Scene, settings: ColumnSettings) -> InputError:
+    return InputError(
+        "no column stands out of the noise",
+        "columns",
+        f"columns {'brighter' if scene.sign > 0 else 'darker'} than their surroundings",
+        "none",
+        f"Check the contrast (now {settings.contrast}) and spacing_px, or give the columns in a CSV file",
+    )
 
 
 def _lattice_of(scene: _Scene, settings: ColumnSettings) -> Lattice:

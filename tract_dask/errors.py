@@ -68,5 +68,11 @@ class StoreError(TractError):
     """A store is damaged, unfinished, or could not be written (a full disk)."""
 
 
+class MissingStoreError(StoreError):
+    """What is to be read is not there, is not finished, or is something else; nothing was started."""
+
+    exit_code = 2
+
+
 class ClusterError(TractError):
     """The scheduler or its workers cannot do the work."""

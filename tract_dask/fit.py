@@ -18,7 +18,7 @@ from . import results, schema, stores
 from .errors import SettingsError
 from .kernels.gaussian import blurred
 from .measure import Floats, Job, measure
-from .movie import Movie, open_movie
+from .movie import Movie
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
@@ -77,7 +77,7 @@ def fit_columns(
     job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed, refine_columns=refine_columns)
     n_columns = len(job.reference)
     names = [name for name in schema.RESULTS if name not in ("time", "drift_measured")]
-    sizes = {"frame": movie.n_frames, "column_id": n_columns, "parameter": len(schema.PARAMETERS), "axis": 2}
+    sizes = {"frame": movie.n_frames, "column_id": n_columns} | schema.SIZES
     chunk = {shard.index: shard for shard in movie.shards}
 
     def fit_packed(index: NDArray[np.int64]) -> Floats:
@@ -107,7 +107,8 @@ def fit_columns(
     dataset = columns.assign_coords(schema.coordinates(movie.n_frames)).assign(variables)
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", frame_times(movie), schema.RESULTS["time"].attributes)
-    dataset.attrs = {"pixel_size_pm": movie.pixel_size_pm, "frame_time_s": movie.frame_time_s, "dose": movie.dose}
+    blur = columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px)
+    dataset.attrs = _calibration(movie) | results.how_fitted(job.settings, job.window, blur)
     return dataset
 
 
@@ -158,7 +159,7 @@ def fit_movie(
             summary[name] += payload[name]
 
     stream_shards(
-        partial(_fit_task, movie.path, path, key),
+        partial(_fit_task, movie, path, key),
         movie.shards,
         add,
         journal=journal,
@@ -249,8 +250,8 @@ def frame_times(movie: Movie) -> Floats:
     return np.arange(movie.n_frames, dtype=np.float64) * (movie.frame_time_s or 1.0)
 
 
-def _fit_task(movie_path: Path, path: Path, key: str, shard: Shard) -> Payload:
-    movie, job = _load(movie_path, path, key)
+def _fit_task(movie: Movie, path: Path, key: str, shard: Shard) -> Payload:
+    job = _load(movie, path, key)
     values = measure(movie, shard, job)
     results.write(path, shard, values, movie.shards[0].frames)
     fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
@@ -262,9 +263,8 @@ def _fit_task(movie_path: Path, path: Path, key: str, shard: Shard) -> Payload:
 
 
 @lru_cache(maxsize=4)
-def _load(movie_path: Path, path: Path, key: str) -> tuple[Movie, Job]:
+def _load(movie: Movie, path: Path, key: str) -> Job:
     """Return what the tasks of one fit stage share, from the stores; ``key`` tells one stage from the next."""
-    movie = open_movie(movie_path)
     store = stores.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
     about = stores.attributes(path)
     bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
@@ -272,7 +272,7 @@ def _load(movie_path: Path, path: Path, key: str) -> tuple[Movie, Job]:
     settings = from_toml(FitSettings, about["settings"], str(path))
     drift = store["drift_measured"].to_numpy()
     reference = _reference(store, about["reference_blur_px"], settings)
-    return movie, Job(reference, drift, bad, about["window"], vacuum, about["refine_columns"], settings)
+    return Job(reference, drift, bad, about["window"], vacuum, about["refine_columns"], settings)
 
 
 def _reference(columns: xr.Dataset, blur_sigma_px: float, settings: FitSettings) -> Floats:

@@ -29,8 +29,12 @@ ENVIRONMENT = {
     **dict.fromkeys(THREAD_VARIABLES, "1"),
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
+    "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
 """What has to be set before a worker's libraries are loaded: one thread each; and freed memory is used again.
+
+Arrow, which pandas imports where it is installed, would start a thread for its memory, and a process with threads
+should not be forked.
 
 Dask's own limit for that, 64 KiB, makes the system clear the pages of every buffer anew: as much work as decoding.
 """

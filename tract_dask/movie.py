@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from . import schema, stores
-from .errors import StoreError
+from .errors import MissingStoreError, StoreError
 from .kernels.filters import Tiles
 from .ome import AXES
 from .shard_files import Grid, ShardReader, overlaps, shard_path
@@ -30,13 +32,13 @@ def open_movie(path: str | Path) -> Movie:
 
     Raises
     ------
-    StoreError
+    MissingStoreError
         Where there is none, or it is unfinished; with the number of shards that are missing.
     """
     path = Path(path).absolute()
     present = stores.attributes(path)
     if present.get("kind") != "movie":
-        raise StoreError(
+        raise MissingStoreError(
             "there is no movie store here",
             str(path),
             "a store made by tract_dask's convert",
@@ -47,7 +49,7 @@ def open_movie(path: str | Path) -> Movie:
     if not present["complete"]:
         n_shards = len(split(shape[0], present["frames_per_shard"]))
         n_done = len({index for index, _ in entries(journal_beside(path))})
-        raise StoreError(
+        raise MissingStoreError(
             f"the movie is unfinished: {n_shards - n_done} of {n_shards} shards are missing",
             str(path),
             remedy=f"Run convert on {present['source']} again: it goes on from there",
@@ -96,7 +98,7 @@ class Movie:
     dose: float | None
     gain: float
 
-    def __reduce__(self) -> tuple[Callable[[Path], Movie], tuple[Path]]:
+    def __reduce__(self) -> tuple[Callable[..., Movie], tuple[Any, ...]]:
         return open_movie, (self.path,)
 
     @property
@@ -114,6 +116,11 @@ class Movie:
         """The shards, in order: every frame in exactly one."""
         return split(self.n_frames, self.frames_per_shard)
 
+    @property
+    def layer_frames(self) -> int:
+        """Frames in a layer of tiles: those that are decoded together."""
+        return _open_level(self.path, self.key, "0").grid.chunk[0]
+
     def read(self, start: int, stop: int, y: slice = _EVERYTHING, x: slice = _EVERYTHING) -> Frames:
         """Return frames ``start`` to ``stop`` (not included), or a part of their field; (frames, y, x).
 
@@ -123,6 +130,8 @@ class Movie:
 
     def read_tiles(self, start: int, stop: int, boxes: NDArray[np.int64]) -> Tiles:
         """Return the tiles of frames ``start`` to ``stop`` (not included) that boxes touch, as they are decoded.
+
+        They are valid until the next call in the same thread, which decodes into the same memory.
 
         Parameters
         ----------
@@ -137,7 +146,7 @@ class Movie:
         wanted = np.argwhere(place >= 0).tolist()
         number, first = divmod(start, self.frames_per_shard)
         layers = range(first // depth, -(-(stop - number * self.frames_per_shard) // depth))
-        pixels = np.empty((len(wanted), len(layers) * depth, height, width), self.dtype)
+        pixels = _reused((len(wanted), len(layers) * depth, height, width), self.dtype)
         with self._shard("0", number) as reader:
             for k, layer in enumerate(layers):
                 for tile, (row, column) in zip(pixels, wanted, strict=True):
@@ -190,6 +199,7 @@ class Movie:
             name=f"movie-{self.key}",
             meta=np.empty((0, 0, 0), self.dtype),
             inline_array=True,
+            fancy=False,
         )
         store = xr.open_zarr(self.path, consolidated=False, chunks=None)
         known = {name: getattr(self, name) for name in schema.CALIBRATION}
@@ -240,7 +250,24 @@ class _LazyFrames:
         return self.movie.dtype
 
     def __getitem__(self, part: Any) -> Frames:
-        return np.asarray(stores.open_array(self.movie.path / "0")[part])
+        (t, inside_t), (y, inside_y), (x, inside_x) = map(_run, part, self.movie.shape)
+        return self.movie.read(t.start, t.stop, y, x)[inside_t, inside_y, inside_x]
+
+
+def _run(index: int | slice, length: int) -> tuple[slice, int | slice]:
+    """Return the shortest run along an axis that holds what an index picks, and the index inside the run.
+
+    Examples
+    --------
+    >>> _run(slice(-2, 1, -3), 10)
+    (slice(2, 9, None), slice(None, None, -3))
+    """
+    if not isinstance(index, slice):
+        place = range(length)[index]
+        return slice(place, place + 1), 0
+    picked = range(length)[index]
+    first, last = (min(picked[0], picked[-1]), max(picked[0], picked[-1])) if picked else (0, -1)
+    return slice(first, last + 1), slice(None, None, picked.step)
 
 
 @dataclass(frozen=True)
@@ -261,9 +288,27 @@ def _open_level(path: Path, key: str, name: str) -> _Level:
 
 def _touched(boxes: NDArray[np.int64], shape: tuple[int, ...], tile: tuple[int, int]) -> NDArray[np.int64]:
     """Return a number for every tile (rows, columns) that a box touches, counted in their order; -1 for the others."""
-    touched = np.zeros([-(-length // side) for length, side in zip(shape, tile, strict=True)], np.bool_)
-    first = np.maximum(boxes[:, :2], 0) // tile
-    last = -(-np.clip(boxes[:, 2:], 0, shape) // tile)
-    for (top, left), (bottom, right) in np.unique(np.stack([first, last], axis=1), axis=0).tolist():
-        touched[top:bottom, left:right] = True
+    rows, columns = (-(-length // side) for length, side in zip(shape, tile, strict=True))
+    top, left = (np.clip(boxes[:, :2], 0, shape) // tile).T
+    bottom, right = (-(-np.clip(boxes[:, 2:], 0, shape) // tile)).T
+    corners = np.zeros((rows + 1, columns + 1), np.int64)  # summed along both axes, boxes that touch a tile
+    for row, column, step in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
+        np.add.at(corners, (row, column), step)
+    touched = corners.cumsum(axis=0).cumsum(axis=1)[:rows, :columns] > 0
     return np.where(touched, np.cumsum(touched).reshape(touched.shape) - 1, -1)
+
+
+_memory = threading.local()
+
+
+def _reused(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Frames:
+    """Return an array, not initialised, in memory that the next call in the same thread uses again.
+
+    Fresh memory is cleared by the system page by page, which costs a quarter of what decoding into it does.
+    """
+    size = math.prod(shape) * dtype.itemsize
+    if getattr(_memory, "room", np.empty(0)).size < size:
+        _memory.room = None  # freed before the larger one is taken
+        _memory.room = np.empty(size, np.uint8)
+    room: Frames = _memory.room[:size].view(dtype).reshape(shape)
+    return room

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import tomllib
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -104,6 +104,51 @@ def setting_options(*groups: str) -> Callable[[F], F]:
                 help="Settings to start from, such as the run.toml of an earlier run; options override them.",
             )(decorated),
         )
+
+    return decorate
+
+
+def class_options(
+    kind: type[Settings],
+    name: str,
+    heading: str,
+    *,
+    presets: Mapping[str, Settings] | None = None,
+    without: tuple[str, ...] = (),
+) -> Callable[[F], F]:
+    """Give a command an option for every setting of a class that is no part of a run's settings.
+
+    Parameters
+    ----------
+    kind, name
+        The class, and the argument in which the command receives an instance.
+    heading
+        Of the options in the help.
+    presets
+        Instances to choose from with ``--preset``, the first by default; options override what it says.
+    without
+        Settings that get no option.
+    """
+    cls = type("ClassOption", (SettingOption,), {"heading": heading})
+    fields = [field for field in _fields(kind) if field[0].name not in without]
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def command(*args: Any, **values: Any) -> Any:
+            start = presets[values.pop("preset")] if presets else kind()
+            given = {item.name: values.pop(f"{name}__{item.name}") for item, _ in fields}
+            changes = {option: value for option, value in given.items() if value is not None}
+            return function(*args, **{name: dataclasses.replace(start, **changes)}, **values)
+
+        decorated: Any = command
+        for field in reversed(fields):
+            decorated = _option(name, field, cls)(decorated)
+        if presets:
+            first, *_ = presets
+            text = f"The settings to start from; the options below override them. [{first}]."
+            choice = click.Choice(tuple(presets))
+            decorated = click.option("--preset", type=choice, default=first, cls=cls, help=text)(decorated)
+        return typing.cast("F", decorated)
 
     return decorate
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,14 +19,13 @@ from distributed import Client
 
 from . import stores
 from .cluster import LazyClient, local_memory_limit, memory_budget
-from .columns import check_inside
 from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError
 from .fit import FitSummary
 from .io import FrameSource, open_source
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
-from .progress import Event, JsonLines, RunDone, RunStarted, Sink, StageDone, silent, tee
+from .progress import Event, JsonLines, RunDone, RunStarted, Sink, StageDone, Warned, silent, tee
 from .seeds import read_columns_csv
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import journal_beside, split
@@ -37,6 +37,9 @@ WORKER_BYTES = 300_000_000
 
 BATCH_BYTES = 128_000_000
 """What a task that reads the movie works on at a time, beside the frames themselves and the sums of the field."""
+
+_FILTER_BYTES = 40
+"""A pixel of a frame that is filtered as a whole: its transform, powers and rings, or the dual of its gradient."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,11 @@ class Outputs:
         return self.root / "results.zarr"
 
     @property
+    def report(self) -> Path:
+        """What was measured, and how well, as one page."""
+        return self.root / "report.html"
+
+    @property
     def settings(self) -> Path:
         """Every setting of the run."""
         return self.root / "run.toml"
@@ -82,7 +90,7 @@ class Outputs:
 
     def paths(self) -> dict[str, str]:
         """Return the paths by name."""
-        names = ("movie", "drift", "sum", "columns", "results", "settings", "events")
+        names = ("movie", "drift", "sum", "columns", "results", "report", "settings", "events")
         return {name: str(getattr(self, name)) for name in names} | {"figure": str(self.columns.with_suffix(".png"))}
 
 
@@ -165,6 +173,7 @@ def plan_run(
     layout = plan_layout(shape, dtype, settings.convert)
     raw = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
     shard = raw // shape[0] * layout.frames_per_shard
+    filtered = _FILTER_BYTES * shape[1] * shape[2] if settings.fit.filters_frames else 0
     binned = sum(4 * shape[0] * (shape[1] // bin_) * (shape[2] // bin_) for bin_ in layout.bins)
     return Plan(
         frames=shape[0],
@@ -172,7 +181,8 @@ def plan_run(
         frames_per_shard=layout.frames_per_shard,
         bytes_read=3 * raw + binned,
         bytes_written=raw + binned,
-        peak_memory=WORKER_BYTES + max(peak_memory(layout), BATCH_BYTES + max(2 * shard, 24 * shape[1] * shape[2])),
+        peak_memory=WORKER_BYTES
+        + max(peak_memory(layout), BATCH_BYTES + max(2 * shard, 24 * shape[1] * shape[2]) + filtered),
         memory_limit=memory_limit,
     )
 
@@ -186,6 +196,7 @@ def run(
     on_event: Sink = silent,
     overwrite: bool = False,
     plan_only: bool = False,
+    report: bool = True,
 ) -> RunOutcome:
     """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
 
@@ -206,6 +217,8 @@ def run(
         Begin anew, even where the folder holds something else.
     plan_only
         Only plan, and write nothing.
+    report
+        Write ``report.html`` at the end, where it is not there yet or of other tracks.
 
     Raises
     ------
@@ -227,7 +240,7 @@ def run(
         with _sole_run(outputs):
             if overwrite:
                 _clear(outputs)
-            return _run(opened, outputs, settings, client, on_event)
+            return _run(opened, outputs, settings, client, on_event, report=report)
 
 
 def run_convert(
@@ -305,7 +318,13 @@ def run_fit(
 
 
 def _run(
-    source: FrameSource, outputs: Outputs, settings: RunSettings, client: Client | None, on_event: Sink
+    source: FrameSource,
+    outputs: Outputs,
+    settings: RunSettings,
+    client: Client | None,
+    on_event: Sink,
+    *,
+    report: bool,
 ) -> RunOutcome:
     """Run the stages in their order."""
     record = _Record()
@@ -316,10 +335,13 @@ def _run(
         movie = convert_stage(source, outputs.movie, settings, session.workers, send, overwrite=True)
         drift = drift_stage(movie, outputs.drift, settings.drift, session.workers, send)
         summed = sum_stage(movie, drift, outputs.sum, session.workers, send)
-        columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send)
+        columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
         refine = _refine_columns(settings)
         summary = fit_stage(movie, columns, drift, summed, outputs.results, settings.fit, refine, session.workers, send)
+        session.finish_aside()
         stores.write_aside(outputs.settings, _run_toml(settings, _resolved(movie, columns, outputs)).encode())
+        if report:
+            _report(outputs, send)
         session.state = "done_with_bad_frames" if summary.bad_frames else "done"
         session.message = "" if record.seconds else "all was done before: nothing to do"
     return RunOutcome(
@@ -336,8 +358,23 @@ def _run(
     )
 
 
+def _report(outputs: Outputs, send: Sink) -> None:
+    """Write the report, if there is none of these tracks; whatever goes wrong, the tracks are done."""
+    from .report import is_current, write_report  # takes its time to import
+
+    try:
+        if not is_current(outputs.root):
+            write_report(outputs.root, figures=False)
+    except Exception as error:  # noqa: BLE001  nothing in a page of figures may undo a finished run
+        stores.remove(outputs.report)  # it would be of other tracks
+        send(Warned(f"the report could not be made: {error}"))
+
+
 class _Session:
-    """What every job has around it: a client at its first use, and events that tell its beginning and its end."""
+    """What every job has around it: a client at its first use, and events that tell its beginning and its end.
+
+    A thread does what nothing waits for, while the workers work.
+    """
 
     def __init__(
         self,
@@ -351,6 +388,16 @@ class _Session:
         self._started, self._plan, self._began = RunStarted(source, str(output)), plan, perf_counter()
         self.workers, self.send = LazyClient(cluster, client, self._on_connect), send
         self.state, self.message = "done", ""
+        self._thread, self._asides = ThreadPoolExecutor(1, "aside"), list[Future[object]]()
+
+    def aside(self, work: Callable[[], object]) -> None:
+        """Let the thread do some work."""
+        self._asides.append(self._thread.submit(work))
+
+    def finish_aside(self) -> None:
+        """Wait for the thread; raise what went wrong in it."""
+        for future in self._asides:
+            future.result()
 
     def __enter__(self) -> _Session:
         self.send(self._started)
@@ -359,6 +406,7 @@ class _Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._thread.shutdown(cancel_futures=True)
         self.workers.close()
         if kind is not None:
             self.state, self.message = "interrupted" if kind is KeyboardInterrupt else "failed", ""
@@ -368,6 +416,7 @@ class _Session:
         if self._plan:
             dataclasses.replace(self._plan, memory_limit=memory_budget(client)).check()
         self.send(dataclasses.replace(self._started, dashboard=client.dashboard_link or ""))
+        self.aside(_get_ready)
 
 
 class _Record:
@@ -383,6 +432,15 @@ class _Record:
                 self.reused += (event.stage,)
             else:
                 self.seconds[event.stage] = event.seconds
+
+
+def _get_ready() -> None:
+    """Import what the later stages need here, and make the compiler ready to load kernels."""
+    from . import columns, report  # noqa: F401
+    from .kernels.registration import clean_image
+    from .plots import plot_columns  # noqa: F401
+
+    clean_image(np.zeros((8, 8), np.float32))
 
 
 def _open(source: str | Path, settings: RunSettings) -> FrameSource:
@@ -424,6 +482,8 @@ def _check_inputs(source: FrameSource, settings: RunSettings) -> None:
     if settings.drift.method == "csv":
         read_drift_csv(_required(settings.drift.csv, "--drift-csv"), source.shape[0])
     if settings.columns.method == "csv":
+        from .columns import check_inside
+
         table = _required(settings.columns.csv, "--columns")
         check_inside(read_columns_csv(table), source.shape[1:], str(table))
     if settings.fit.window_px is not None:
@@ -472,7 +532,8 @@ def _clear(outputs: Outputs) -> None:
     for path in stages:
         stores.remove(path)
         stores.remove(journal_beside(path))
-    for path in (outputs.columns, outputs.columns.with_suffix(".png"), outputs.settings, outputs.events):
+    files = (outputs.columns, outputs.columns.with_suffix(".png"), outputs.report, outputs.settings, outputs.events)
+    for path in files:
         stores.remove(path)
 
 

@@ -6,6 +6,7 @@ that tasks need nothing but its path, and a viewer can open it while the fits st
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,17 @@ import zarr
 from zarr.codecs import BloscCodec
 
 from . import schema, stores
-from .errors import StoreError
+from .errors import MissingStoreError, SettingsError
 from .schema import REJECTED, Status
+from .settings import FitSettings, from_toml
 from .shard_files import BLOSC, encode
 from .shards import Shard
 
 _CODEC = "lz4"
 _FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
 _KNOWN_AT_START = ("drift_measured", "time")
+_CHUNK_BYTES = 32 << 20
+"""Stored chunks are opened in groups, of so many bytes of ``fit``: small ones would be a task each."""
 
 
 def create(
@@ -46,12 +50,7 @@ def create(
     about
         Attributes under :data:`stores.ATTRIBUTE`.
     """
-    sizes = {
-        "frame": len(time),
-        "column_id": columns.sizes["column_id"],
-        "parameter": len(schema.PARAMETERS),
-        "axis": 2,
-    }
+    sizes = {"frame": len(time), "column_id": columns.sizes["column_id"]} | schema.SIZES
     known = {"drift_measured": drift, "time": time}
     static = columns.assign_coords(schema.coordinates(len(time)))
     static = static.assign({name: (schema.RESULTS[name].dims, known[name]) for name in _KNOWN_AT_START})
@@ -115,23 +114,75 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
 
     Raises
     ------
-    StoreError
-        Where there are no results, or they are unfinished.
+    MissingStoreError
+        Where there are no results, they are unfinished, or another version of the package wrote them.
     """
     path = Path(path)
     about = stores.attributes(path)
     if not (path / "fit").is_dir():
-        raise StoreError("there are no results here", str(path), "a results.zarr", remedy="Make it with tract-dask run")
+        raise MissingStoreError(
+            "there are no results here", str(path), "a results.zarr", remedy="Make it with tract-dask run"
+        )
     if not about.get("complete") and not unfinished:
-        raise StoreError(
+        raise MissingStoreError(
             "the fits are not all done",
             str(path),
             remedy="Run the same command again to finish, or open it with unfinished=True",
         )
-    dataset: xr.Dataset = xr.open_zarr(path, consolidated=False)[[*schema.RESULTS, *schema.COLUMNS]]
+    frames, *rest = stores.open_array(path / "fit").chunks
+    frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
+    with stores.codec_pipeline():
+        stored: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
+    if lacking := [name for name in (*schema.RESULTS, *schema.COLUMNS) if name not in stored]:
+        raise MissingStoreError(
+            "these results are of another version",
+            str(path),
+            "all variables of this version",
+            f"no {', '.join(lacking)}",
+            "Fit again with this version: the same tract-dask run, with --overwrite",
+        )
+    dataset = stored[[*schema.RESULTS, *schema.COLUMNS]]
+    dataset = dataset.chunk(frame=frames)
     for key in ("pixel_size_pm", "frame_time_s", "dose"):
         dataset.attrs[key] = about.get(key)
+    settings = from_toml(FitSettings, about["settings"], str(path))
+    dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
     return dataset
+
+
+def how_fitted(settings: FitSettings, window: int, reference_blur_px: float) -> dict[str, Any]:
+    """Return what an analysis needs to know of the fits, as attributes of their Dataset.
+
+    They are the window's diameter, sigma of the blur that the windows went through and of that of the summed image
+    (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, and the ``intensity_scale``.
+    """
+    return {
+        "window_px": window,
+        "window_blur_px": settings.window_blur_px,
+        "reference_blur_px": float(reference_blur_px),
+        "shape": settings.shape,
+        "estimator": settings.estimator,
+        "intensity_scale": settings.intensity_scale,
+    }
+
+
+def fitted_with(tracks: xr.Dataset, name: str) -> Any:
+    """Return one of the attributes that :func:`how_fitted` makes.
+
+    Raises
+    ------
+    SettingsError
+        Where the tracks have lost it.
+    """
+    if name not in tracks.attrs:
+        raise SettingsError(
+            "the tracks do not say how they were fitted",
+            f"tracks.attrs[{name!r}]",
+            "the attributes of tract_dask.open_results or fit_columns",
+            ", ".join(map(str, tracks.attrs)),
+            "Keep them through what you do with the tracks, for instance by xarray.set_options(keep_attrs=True)",
+        )
+    return tracks.attrs[name]
 
 
 def accepted(dataset: xr.Dataset, threshold: float | None = None) -> xr.Dataset:

@@ -30,6 +30,9 @@ CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain")
 AXES = ("y", "x")
 """Labels of the ``axis`` dimension of a drift."""
 
+SIZES = {"parameter": len(PARAMETERS), "axis": len(AXES), "place": 16}
+"""Dimensions of the results that have one length always; a ``place`` is one in vacuum."""
+
 
 class Status(enum.IntFlag):
     """What speaks against a fit; 0 where nothing does.
@@ -93,15 +96,32 @@ RESULTS = _declare(
         "Standard errors of the estimates, from the fit's covariance",
         _NAN,
     ),
+    Variable(
+        "centroid",
+        ("frame", "column_id", "axis"),
+        "float64",
+        "px",
+        "Centroid in a round mask that has moved onto the column; drift-corrected",
+        _NAN,
+    ),
     Variable("intensity", _COLUMN, "float64", "counts", "Column intensity, Equation 3", _NAN),
     Variable("intensity_error", _COLUMN, "float64", "counts", "Error of the intensity, Equation 5", _NAN),
     Variable("intensity_stderr", _COLUMN, "float64", "counts", "Standard error of the intensity, from the fit", _NAN),
     Variable("status", _COLUMN, "uint8", "1", "Flags that speak against a fit", int(Status.NOT_CONVERGED)),
+    Variable(
+        "presence",
+        _COLUMN,
+        "float32",
+        "1",
+        "Matched filter at the column's place: amplitude over its standard error where there is no column",
+        _NAN,
+    ),
+    Variable("presence_vacuum", ("frame", "place"), "float32", "1", "The same at places in vacuum", _NAN),
     Variable("r_squared", _COLUMN, "float32", "1", "Share of the window's variance that the fit explains", _NAN),
     Variable("n_iterations", _COLUMN, "int16", "1", "Iterations of the fit", 0),
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
     Variable("drift_measured", ("frame", "axis"), "float64", "px", "The same, before the columns refined it", _NAN),
-    Variable("noise", ("frame",), "float64", "counts", "Standard deviation in vacuum, after the blur", _NAN),
+    Variable("noise", ("frame",), "float64", "counts", "Standard deviation in vacuum, after the filter", _NAN),
     Variable(
         "time",
         ("frame",),

@@ -138,8 +138,8 @@ class ColumnSettings(Settings):
 
     method: str = setting(
         "auto",
-        "Find columns automatically, on lattices, or at the positions of a CSV file",
-        choices=("auto", "lattice", "csv"),
+        "Find columns automatically, on lattices, at the positions of a CSV file, or by what stands out of the noise",
+        choices=("auto", "lattice", "csv", "maxima", "blobs", "template"),
         flag="--columns-method",
     )
     csv: str | None = setting(None, "CSV file with columns x, y and optionally column_id, kind", flag="--columns")
@@ -164,6 +164,15 @@ class ColumnSettings(Settings):
         high=1,
         flag="--min-amplitude",
     )
+    detection_threshold: float = setting(
+        5.0, "Methods maxima, blobs, template: weakest column, in units of what noise alone shows", low=0, high=1e4
+    )
+    template: tuple[int, ...] | None = setting(
+        None,
+        "Method template: x, y of the column that the others look like; unset: the mean of the strongest",
+        unit="px",
+        flag="--template-at",
+    )
 
 
 @dataclass(frozen=True)
@@ -183,12 +192,43 @@ class FitSettings(Settings):
         "Sigmas and theta of a column stay as in the summed image, or are fitted in every frame (free, the paper's)",
         choices=("fixed", "free"),
     )
+    filter: str = setting(
+        "gaussian",
+        "What frames go through before lsq fits: a Gaussian blur, a filter of the whole frame, or nothing",
+        choices=("gaussian", "wiener", "tv-l1", "none"),
+    )
     blur_sigma_px: float = setting(
         2.0,
         "Gaussian blur (the paper's 2 px) before columns, noise and lsq fits are looked at; 0 leaves pixels raw",
         unit="px",
         low=0,
         high=20,
+    )
+    wiener_background: float = setting(
+        1.0,
+        "Filter wiener: times that the radial background of the power spectrum is subtracted",
+        low=0,
+        high=100,
+    )
+    wiener_cutoff: float = setting(
+        0.3,
+        "Filter wiener: frequency at which its low pass halves the power, in units of half a cycle a pixel",
+        low=0.01,
+        high=100,
+    )
+    tv_fidelity: float = setting(
+        0.9,
+        "Filter tv-l1: weight of fidelity; a disc is removed where its radius is below 2 over this",
+        unit="1/px",
+        low=1e-3,
+        high=100,
+    )
+    tv_iterations: int = setting(200, "Filter tv-l1: most iterations", low=1, high=100000)
+    mask_radius_px: float | None = setting(
+        None,
+        "Radius of the centroid's mask; unset: 1.894 of the column's sigma, with which its noise is least",
+        unit="px",
+        low=1.5,
     )
     max_shift_px: float | None = setting(
         None,
@@ -223,10 +263,31 @@ class FitSettings(Settings):
     )
     max_iterations: int = setting(50, "Most iterations of one fit", low=1, high=10000)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.estimator == "poisson" and self.filters_frames:
+            raise SettingsError(
+                "filtered frames are not counts",
+                "setting filter (FitSettings)",
+                "gaussian or none, which leave the windows of the estimator poisson raw",
+                repr(self.filter),
+                "Choose the estimator lsq, or another filter",
+            )
+
+    @property
+    def filters_frames(self) -> bool:
+        """Whether the filter needs the whole frame, and makes standard errors unknown."""
+        return self.filter in ("wiener", "tv-l1")
+
     @property
     def window_blur_px(self) -> float:
         """Sigma of the blur that windows go through before they are fitted: none where counts are."""
-        return 0.0 if self.estimator == "poisson" else self.blur_sigma_px
+        return 0.0 if self.estimator == "poisson" or self.filter != "gaussian" else self.blur_sigma_px
+
+    @property
+    def noise_blur_px(self) -> float:
+        """Sigma of the blur before the noise is measured: none where whole frames are filtered."""
+        return 0.0 if self.filters_frames else self.blur_sigma_px
 
 
 @dataclass(frozen=True)

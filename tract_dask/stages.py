@@ -19,7 +19,6 @@ import xarray as xr
 from distributed import Client
 
 from . import fit, stores
-from .columns import find_columns
 from .conversion import convert, movie_key
 from .drift import estimate_drift
 from .errors import DestinationError
@@ -37,6 +36,14 @@ STAGES = ("convert", "drift", "sum", "columns", "fit")
 
 Workers = Callable[[], Client]
 """Gives the client; connects at its first call (:class:`tract_dask.cluster.LazyClient`)."""
+
+Aside = Callable[[Callable[[], object]], object]
+"""Takes work that nothing waits for but the end of the run."""
+
+
+def at_once(work: Callable[[], object]) -> object:
+    """Do the work now."""
+    return work()
 
 
 def convert_stage(
@@ -99,11 +106,12 @@ def columns_stage(
     on_event: Sink = silent,
     *,
     overwrite: bool = False,
+    aside: Aside = at_once,
 ) -> xr.Dataset:
     """Return the columns of a summed image, kept as the table ``csv``, with ``.zarr`` and ``.png`` of the same name.
 
     Where the table was edited by hand since, its columns are refined and returned instead, and the table is left
-    as it is.
+    as it is. The figure is drawn by ``aside``.
 
     Raises
     ------
@@ -113,6 +121,8 @@ def columns_stage(
     store, figure = csv.with_suffix(".zarr"), csv.with_suffix(".png")
     plain = dataclasses.replace(settings, csv=None)
     window, blur = fit_settings.window_px, fit_settings.blur_sigma_px
+    from .columns import find_columns  # workers, which are forked once this room is imported, do not need it
+
     find = partial(find_columns, summed, window_px=window, blur_sigma_px=blur)
     key = stage_key(summed["image"].to_numpy().tobytes(), plain, _content(settings.csv), f"{window} {blur}")
     about, table, pixel_size = stores.attributes(store), _content(csv), summed.attrs.get("pixel_size_pm")
@@ -137,9 +147,6 @@ def columns_stage(
     else:
         found = _reopened(store) if same else find(settings)
     found.attrs["pixel_size_pm"] = pixel_size
-    from .plots import plot_columns  # matplotlib takes its time, and not every run draws
-
-    plot_columns(summed, found, figure)
     by_hand = edited or bool(about.get("edited"))
     if not same:
         if by_hand and table:
@@ -149,6 +156,8 @@ def columns_stage(
     _save(found, store, key, settings, "columns", pixel_size_pm=pixel_size, table=_digest(table), edited=by_hand)
     if not csv.exists():
         stores.write_aside(csv, table)
+    figure.unlink(missing_ok=True)  # it is of other columns
+    aside(partial(_draw, summed, found.copy(), figure))
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
     return found
 
@@ -168,6 +177,15 @@ def fit_stage(
     job = fit.prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
     client = None if _is_done(path, fit.fit_key(movie, columns, job)) else workers()
     return fit.fit_movie(movie, columns, job, path, client=client, on_event=on_event)
+
+
+def _draw(summed: xr.Dataset, columns: xr.Dataset, figure: Path) -> None:
+    """Draw the columns beside the place of their figure, then put them there, so that a figure is always whole."""
+    from .plots import plot_columns  # matplotlib takes its time, and not every run draws
+
+    partial_figure = figure.with_name(f".{figure.stem}.partial{figure.suffix}")
+    plot_columns(summed, columns, partial_figure)
+    partial_figure.replace(figure)
 
 
 def _kept(

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 import zarr
 
-from .errors import DestinationError, StoreError
+from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
 
 ATTRIBUTE = "tract_dask"
@@ -92,13 +92,13 @@ def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
 
     Raises
     ------
-    StoreError
+    MissingStoreError
         Where there is none.
     """
     try:
         dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
-        raise StoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
+        raise MissingStoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
     dataset = (dataset[list(only)] if only else dataset).load()
     return dataset.assign(
         {name: word.astype(object) for name, word in dataset.data_vars.items() if word.dtype.kind == "T"}

@@ -55,15 +55,19 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
     return None
 
 
-def check_box(box: tuple[int, ...], shape: tuple[int, ...], drift: NDArray[np.float64]) -> None:
-    """Check that a vacuum box stays inside the frame whatever the drift.
+def check_box(
+    box: tuple[int, ...],
+    shape: tuple[int, ...],
+    drift: NDArray[np.float64],
+    where: str = "setting vacuum_box (FitSettings)",
+) -> None:
+    """Check that a vacuum box stays inside the frame whatever the drift; ``where`` is what an error names.
 
     Raises
     ------
     SettingsError
         Naming the first frame where it leaves.
     """
-    where = "setting vacuum_box (FitSettings)"
     if len(box) != 4 or box[0] >= box[1] or box[2] >= box[3]:
         raise SettingsError(
             "this is not a box", where, "y0, y1, x0, x1 with y0 < y1 and x0 < x1", str(box), "Correct it"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from .errors import SettingsError
 
@@ -15,6 +14,8 @@ def neighbour_distance(places: NDArray[np.float64]) -> float | None:
     """Return the median distance of places (n, 2) to their nearest neighbours, px; None where there is none."""
     if len(places) < 2:
         return None
+    from scipy.spatial import cKDTree  # takes its time, and workers do not need it
+
     distances = np.asarray(cKDTree(places).query(places, k=2)[0])
     return float(np.median(distances[:, 1])) or None
 

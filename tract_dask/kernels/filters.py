@@ -1,8 +1,8 @@
 """Gaussian blur, of whole images and of windows cut from frames, with one result bit for bit.
 
-Both go through the same sums in the same order, in float32, block by block: the pixels of a block and of its margin are
-loaded, then weighed along x, then along y. Beyond the frame its edge pixel goes on, as in ``scipy.ndimage`` with
-``mode="nearest"``.
+An image is blurred as windows of all its columns and some rows, so both go through the same sums in the same order, in
+float32: the pixels of a window and of its margin are loaded, then weighed along y, then along x. Beyond the frame its
+edge pixel goes on, as in ``scipy.ndimage`` with ``mode="nearest"``.
 
 The weights are a tuple, from the centre outwards. Its length is part of its type, so that the compiler knows the number
 of terms, unrolls their sum, and keeps it in vector registers.
@@ -17,12 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from .simd import LANES, load_at, store
+from .simd import INLINE, LANES, aligned_rows, converted, load, number, put, rows_of, store, store_at
+from .tracing import VECTOR, Index, Rows, Vector, traced
 
 Array = npt.NDArray[Any]
 Weights = tuple[np.float32, ...]
 
-_BLOCK = (64, 256)
+_STRIP_ROWS = 16
 
 
 class Tiles(NamedTuple):
@@ -90,11 +91,15 @@ def blur(image: Array, sigma: float) -> npt.NDArray[np.float32]:
     """
     if image.ndim != 2:
         raise ValueError(f"image must be (ny, nx), got {image.shape}")
-    out = np.empty(image.shape, np.float32)
-    if image.size:
-        pixels = _readable(image)[None, None]
-        _blur_image(pixels, np.zeros((1, 1), np.int64), _weights(sigma), _BLOCK, out)
-    return out
+    height, width = image.shape
+    tiles, out = _one_tile(image[None]), _room_for(image.size)
+    whole = height - height % _STRIP_ROWS
+    for rows, first, stop in ((_STRIP_ROWS, 0, whole), (height - whole, whole, height)):
+        corner_y = np.arange(first, stop, _STRIP_ROWS)[None]
+        if corner_y.size and width:
+            corner_x = np.zeros_like(corner_y)
+            _write_windows(tiles, 0, corner_y, corner_x, (rows, width), sigma, 1.0, out[first * width :])
+    return out[: image.size].reshape(image.shape)
 
 
 def cut_windows(
@@ -136,12 +141,11 @@ def cut_windows(
     if corners_y.ndim != 2 or corners_y.shape != corners_x.shape or first + len(corners_y) > tiles.pixels.shape[1]:
         most = tiles.pixels.shape[1] - first
         raise ValueError(f"corners must be (f, n), f up to {most}, got {corners_y.shape} and {corners_x.shape}")
-    out = np.empty((*corners_y.shape, size, size), np.float32)
-    pixels = _readable(tiles.pixels)
-    weights = _weights(sigma)
-    if not _cut(pixels, tiles.place, tiles.shape, first, corners_y, corners_x, np.float32(gain), weights, out):
+    shape = (*corners_y.shape, size, size)
+    out = _room_for(math.prod(shape))
+    if not _write_windows(tiles, first, corners_y, corners_x, (size, size), sigma, gain, out):
         raise ValueError("a window reaches into a tile that is missing")
-    return out
+    return out[: math.prod(shape)].reshape(shape)
 
 
 def _one_tile(frames: Array) -> Tiles:
@@ -165,127 +169,158 @@ def _weights(sigma: float) -> Weights:
     return tuple(kernel[kernel.size // 2 :])
 
 
-@njit(cache=True, nogil=True)
-def _cut(
-    pixels: Array,
-    place: Array,
-    shape: tuple[int, int],
+def _room_for(pixels: int) -> npt.NDArray[np.float32]:
+    """Return room for pixels and for what a whole vector at the end of the last row writes beyond them."""
+    return np.empty(pixels + LANES, np.float32)
+
+
+def _write_windows(
+    tiles: Tiles,
     first: int,
-    corner_y: Array,
-    corner_x: Array,
-    gain: Any,
-    weights: Weights,
-    out: Array,
+    corner_y: npt.NDArray[np.int64],
+    corner_x: npt.NDArray[np.int64],
+    sides: tuple[int, int],
+    sigma: float,
+    gain: float,
+    out: npt.NDArray[np.float32],
 ) -> bool:
-    """Write every window, blurred; zeros where it leaves the frame. Return whether no tile was missing."""
-    size = out.shape[2]
-    block, across, last = _scratch(size, size, len(weights) - 1)
-    complete = True
-    for f in range(out.shape[0]):
-        for n in range(out.shape[1]):
-            y, x = corner_y[f, n], corner_x[f, n]
-            if y < 0 or x < 0 or y + size > shape[0] or x + size > shape[1]:
-                out[f, n] = 0
-            else:
-                complete &= _load(pixels, place, shape, first + f, y, x, size, size, len(weights) - 1, gain, block)
-                _blur_block(block, weights, across, last, out[f, n])
+    """Write windows of these sides, blurred, one after the other; zeros where one leaves the frame.
+
+    Return whether no tile was missing.
+    """
+    pixels, weights = _readable(tiles.pixels), _weights(sigma)
+    margin = len(weights) - 1
+    row = -(-(-(-sides[1] // LANES) * LANES + 2 * margin) // LANES)
+    room = aligned_rows((2 * sides[0] + 2 * margin) * row)
+    room[...] = 0
+    layout = (*pixels.shape[1:], *tiles.shape)
+    complete: bool = _cut(
+        pixels.reshape(-1),
+        layout,
+        tiles.place,
+        first,
+        (corner_y, corner_x),
+        sides,
+        np.float32(gain),
+        weights,
+        (room, row),
+        out,
+    )
     return complete
 
 
-@njit(cache=True, nogil=True)
-def _blur_image(pixels: Array, place: Array, weights: Weights, sides: tuple[int, int], out: Array) -> None:
-    """Write the whole blurred image, of which ``pixels`` is the only tile, in blocks of at most these sides."""
-    block, across, last = _scratch(sides[0], sides[1], len(weights) - 1)
-    for y in range(0, out.shape[0], sides[0]):
-        for x in range(0, out.shape[1], sides[1]):
-            part = out[y : y + sides[0], x : x + sides[1]]
-            height, width = part.shape
-            _load(pixels, place, out.shape, 0, y, x, height, width, len(weights) - 1, np.float32(1), block)
-            _blur_block(block, weights, across, last, part)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cut(
+    pixels: Array,
+    layout: tuple[int, int, int, int, int],
+    place: Array,
+    first: int,
+    corners: tuple[Array, Array],
+    sides: tuple[int, int],
+    gain: Any,
+    weights: Weights,
+    work: tuple[Array, int],
+    out: Array,
+) -> bool:
+    """Write every window, blurred; zeros where it leaves the frame. Return whether no tile was missing.
+
+    A row of a window is written in whole vectors; what the last one writes beyond the row, the next row replaces.
+
+    Parameters
+    ----------
+    layout
+        Frames, rows and columns of a tile; rows and columns of a frame.
+    work
+        Room for a window with its margin, and for its sums along y, and the vectors in a row of both.
+    """
+    corner_y, corner_x = corners
+    height, width = sides
+    room, row = work
+    margin = len(weights) - 1
+    block = rows_of(room)
+    sums = block + (height + 2 * margin) * row
+    complete = True
+    at = 0
+    for f in range(corner_y.shape[0]):
+        for n in range(corner_y.shape[1]):
+            y, x = corner_y[f, n], corner_x[f, n]
+            if y < 0 or x < 0 or y + height > layout[3] or x + width > layout[4]:
+                out[at : at + height * width] = 0
+            else:
+                corner = (y - margin, x - margin)
+                complete &= _load(pixels, layout, place, first + f, corner, sides, margin, gain, block, row)
+                for i in range(height * row):
+                    store(sums, i, _weighted(block, (i + margin * row) * LANES, row * LANES, weights))
+                for i in range(height):
+                    for j in range(0, width, LANES):
+                        value = _weighted(sums, i * row * LANES + margin + j, 1, weights)
+                        store_at(out, at + i * width + j, value)
+            at += height * width
+    return complete
 
 
-@njit(cache=True, nogil=True)
-def _scratch(height: int, width: int, margin: int) -> tuple[Array, Array, Array]:
-    """Return zeros for a block with its margin, its sums along x, and a row of its sums along y, in whole vectors."""
-    wide = -(-width // LANES) * LANES
-    return (
-        np.zeros((height + 2 * margin, wide + 2 * margin), np.float32),
-        np.zeros((height + 2 * margin, wide), np.float32),
-        np.zeros(wide, np.float32),
-    )
+@traced(VECTOR)
+def _weighted(source: Rows, middle: Index, step: Index, weights: tuple[Vector, ...]) -> Vector:
+    """Return the weighted sums around LANES pixels of ``source``, counted flat; their terms are ``step`` apart."""
+    total = weights[0] * source.vector(middle)
+    for k in range(1, len(weights)):
+        total = total + weights[k] * (source.vector(middle - step * k) + source.vector(middle + step * k))
+    return total
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _load(
     pixels: Array,
+    layout: tuple[int, int, int, int, int],
     place: Array,
-    shape: tuple[int, int],
     frame: int,
-    y: int,
-    x: int,
-    height: int,
-    width: int,
+    corner: tuple[int, int],
+    sides: tuple[int, int],
     margin: int,
     gain: Any,
-    block: Array,
+    block: Any,
+    row: int,
 ) -> bool:
-    """Fill the first rows and columns of ``block`` with a part of a frame and its margin, times ``gain``.
+    """Fill ``block`` with a part of a frame, from the margin's ``corner`` on, times ``gain``.
 
-    (y, x) is the first pixel inside the margin. Return whether every tile was there.
+    Return whether every tile was there.
     """
-    tall, wide = height + 2 * margin, width + 2 * margin
-    first_y, first_x = y - margin, x - margin
+    frames, side_y, side_x, n_y, n_x = layout
+    first_y, first_x = corner
+    tall, wide, stride = sides[0] + 2 * margin, sides[1] + 2 * margin, row * LANES
     top, left = max(0, -first_y), max(0, -first_x)
-    bottom, right = min(tall, shape[0] - first_y), min(wide, shape[1] - first_x)
-    side_y, side_x = pixels.shape[2:]
-    for row in range((first_y + top) // side_y, (first_y + bottom - 1) // side_y + 1):
-        start_y, stop_y = max(top, row * side_y - first_y), min(bottom, (row + 1) * side_y - first_y)
-        for column in range((first_x + left) // side_x, (first_x + right - 1) // side_x + 1):
-            start_x, stop_x = max(left, column * side_x - first_x), min(right, (column + 1) * side_x - first_x)
-            if place[row, column] < 0:
+    bottom, right = min(tall, n_y - first_y), min(wide, n_x - first_x)
+    for i in range((first_y + top) // side_y, (first_y + bottom - 1) // side_y + 1):
+        start_y, stop_y = max(top, i * side_y - first_y), min(bottom, (i + 1) * side_y - first_y)
+        for j in range((first_x + left) // side_x, (first_x + right - 1) // side_x + 1):
+            start_x, stop_x = max(left, j * side_x - first_x), min(right, (j + 1) * side_x - first_x)
+            if place[i, j] < 0:
                 return False
-            tile = pixels[place[row, column], frame]
-            offset_y, offset_x = first_y - row * side_y, first_x - column * side_x
-            for i in range(start_y, stop_y):
-                source = tile[offset_y + i, offset_x + start_x : offset_x + stop_x]
-                target = block[i, start_x:stop_x]
-                for j in range(target.size):
-                    target[j] = gain * np.float32(source[j])
-    for i in range(top, bottom):
-        for j in range(left):
-            block[i, j] = block[i, left]
-        for j in range(right, wide):
-            block[i, j] = block[i, right - 1]
-    for i in range(tall):
-        edge = top if i < top else bottom - 1
-        if i < top or i >= bottom:
-            for j in range(wide):
-                block[i, j] = block[edge, j]
+            source = ((place[i, j] * frames + frame) * side_y + first_y - i * side_y + start_y) * side_x
+            source += first_x - j * side_x + start_x
+            for y in range(start_y, stop_y):
+                _copy(pixels, source, gain, block, y * stride + start_x, stop_x - start_x)
+                source += side_x
+    for y in range(top, bottom):
+        for x in range(left):
+            put(block, y * stride + x, number(block, y * stride + left))
+        for x in range(right, wide):
+            put(block, y * stride + x, number(block, y * stride + right - 1))
+    for y in range(tall):
+        if y < top or y >= bottom:
+            edge = top if y < top else bottom - 1
+            for j in range(row):
+                store(block, y * row + j, load(block, edge * row + j))
     return True
 
 
-@njit(cache=True, nogil=True)
-def _blur_block(block: Array, weights: Weights, across: Array, last: Array, out: Array) -> None:
-    """Write the blurred block: along x into ``across``, then along y. Columns beyond those of ``out`` are padding."""
-    margin = len(weights) - 1
-    height, width = out.shape
-    for i in range(height + 2 * margin):
-        _weigh(block, i * block.shape[1] + margin, 1, weights, across[i])
-    for i in range(height):
-        _weigh(across, (i + margin) * across.shape[1], across.shape[1], weights, last)
-        for j in range(width):
-            out[i, j] = last[j]
-
-
-@njit(cache=True, nogil=True)
-def _weigh(source: Array, centre: int, step: int, weights: Weights, out: Array) -> None:
-    """Write the weighted sums around ``out.size`` pixels of ``source``, counted flat, from ``centre`` on.
-
-    Their terms are ``step`` apart.
-    """
-    for row in range(out.size // LANES):
-        middle = centre + row * LANES
-        total = weights[0] * load_at(source, middle)
-        for k in range(1, len(weights)):
-            total = total + weights[k] * (load_at(source, middle - k * step) + load_at(source, middle + k * step))
-        store(out, row, total)
+@njit(**INLINE)
+def _copy(pixels: Array, source: int, gain: Any, block: Any, target: int, count: int) -> None:
+    """Copy pixels in a row, times ``gain``, in vectors, of which the last two may overlap."""
+    for j in range(0, count - LANES + 1, LANES):
+        store_at(block, target + j, gain * converted(pixels, source + j))
+    if count >= LANES:
+        store_at(block, target + count - LANES, gain * converted(pixels, source + count - LANES))
+    else:
+        for j in range(count):
+            put(block, target + j, gain * np.float32(pixels[source + j]))

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .covariance import Noise
-from .engine import Options, Results, fit_windows
+from .engine import Options, Problem, fit_windows
 from .filters import gaussian_kernel
-from .gaussian import canonical
 
 __all__ = ["LARGEST_SIGMA", "SMALLEST_SIGMA_PX", "GaussianFits", "Outcome", "fit_gaussians"]
 
@@ -127,34 +126,23 @@ def fit_gaussians(
     if estimator == "poisson" and blur_sigma_px > 0:
         raise ValueError("maximum likelihood needs the counts themselves, not blurred ones")
     n, height, width = windows.shape
-    starts, lowers, uppers = (
-        np.array(np.broadcast_to(np.asarray(values, np.float64), (n, 7)), order="C") for values in (start, lower, upper)
-    )
-    known = np.isfinite(starts).all(axis=1)
-    starts = canonical(np.where(np.isfinite(starts), starts, 0))
-    lowers[:, 3:5] = np.maximum(lowers[:, 3:5].min(axis=1, keepdims=True), SMALLEST_SIGMA_PX)
-    uppers[:, 3:5] = np.minimum(uppers[:, 3:5].max(axis=1, keepdims=True), LARGEST_SIGMA * max(height, width))
-    lowers[:, 5], uppers[:, 5] = -np.inf, np.inf
-    if fixed_shape:
-        lowers[:, 3:5], uppers[:, 3:5] = SMALLEST_SIGMA_PX, LARGEST_SIGMA * max(height, width)
-    if not (lowers <= uppers).all():
-        row = int(np.flatnonzero(~(lowers <= uppers).all(axis=1))[0])
-        raise ValueError(
-            f"bounds of window {row} are empty: lower {lowers[row].tolist()}, upper {uppers[row].tolist()}"
-        )
+    starts, lowers, uppers = (_rows(values, n) for values in (start, lower, upper))
     kernel = gaussian_kernel(blur_sigma_px).astype(np.float64)
     distances = np.arange(kernel.size) - kernel.size // 2
     noise = Noise(float(kernel @ distances**2), float(kernel @ kernel) ** 2, bool(counting))
-    options = Options(estimator == "poisson", bool(fixed_shape), float(tolerance_px), int(max_iterations))
-    results = Results(
-        np.clip(starts, lowers, uppers),
-        np.full((n, 7), np.nan),
-        np.full(n, np.nan),
-        np.zeros(n, np.float32),
-        np.zeros(n, np.int16),
-        np.where(known, 0, Outcome.NOT_FINITE).astype(np.uint8),
-    )
-    fit_windows(
-        windows.reshape(n, height * width), (height, width, float(radius_px)), lowers, uppers, options, noise, results
-    )
+    largest = LARGEST_SIGMA * max(height, width)
+    problem = Problem(starts, lowers, uppers, SMALLEST_SIGMA_PX, largest, bool(fixed_shape))
+    options = Options(estimator == "poisson", float(tolerance_px), int(max_iterations), float(radius_px))
+    empty, results = fit_windows(windows, problem, options, noise)
+    if empty >= 0:
+        low, high = (np.broadcast_to(values, (n, 7))[empty].tolist() for values in (lowers, uppers))
+        raise ValueError(f"bounds of window {empty} are empty: lower {low}, upper {high}")
     return GaussianFits(*results)
+
+
+def _rows(values: npt.ArrayLike, n: int) -> npt.NDArray[np.float64]:
+    """Return parameters for each of ``n`` windows (n, 7), or for all (1, 7)."""
+    rows = np.require(values, np.float64, ("C", "W"))
+    if rows.shape not in ((7,), (1, 7), (n, 7)):
+        rows = np.array(np.broadcast_to(rows, (n, 7)))
+    return rows.reshape(-1, 7)

@@ -7,383 +7,312 @@ and the bounds of the sigmas are to first order bounds of P and Q. A parameter o
 outward stays there for the step; one that a step would carry over a bound is put onto it while the others are solved
 anew: the constrained optimum is found, not a clipped one.
 
-Arrays are (rows, LANES) float32, one row a parameter. Symmetric matrices hold their lower triangle, row by row.
+The functions are traced, see :func:`~tract_dask.kernels.tracing.traced`: lists of vectors, one a parameter, are
+registers, and rows are memory. Symmetric matrices hold their lower triangle, row by row.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numba import njit
 
-from .moments import DATA, FIRST, INNER, N_ROOM, SQUARED, TOTAL, WEIGHT, Array, moment, to_axes
-from .simd import (
-    absolute,
-    count,
-    larger,
-    load,
-    negated,
-    opaque,
-    select,
-    smaller,
-    sqrt,
-    store,
-    vector,
+from .moments import (
+    AMPLITUDE,
+    BACKGROUND,
+    COS,
+    CURVATURE_U,
+    CURVATURE_V,
+    DATA,
+    FIRST,
+    KINDS,
+    N_PARAMETERS,
+    SIN,
+    SQUARED,
+    TOTAL,
+    WEIGHT,
+    X,
+    Y,
+    moment,
+    to_axes,
 )
-
-AMPLITUDE, X, Y, CURVATURE_U, CURVATURE_V, COS, SIN, BACKGROUND, N_PARAMETERS = 0, 1, 2, 3, 4, 5, 6, 7, 8
-"""Rows of a point: the curvatures 1 / sigma^2 along the axes u = (cos, sin) and v = (-sin, cos), with |sin| <= cos."""
+from .tracing import Mask, Rows, Vector, absolute, larger, select, smaller, sqrt
 
 LOWER, UPPER, N_BOUNDS = 0, 5, 10
 """Rows of the bounds: amplitude, x, y, curvature, background."""
 
-BOUND_OF = np.array([0, 1, 2, 3, 3, 3, 4])
-ROW_OF = np.array([AMPLITUDE, X, Y, CURVATURE_U, -1, CURVATURE_V, BACKGROUND])
+BOUND_OF = (0, 1, 2, 3, 3, 3, 4)
+ROW_OF = (AMPLITUDE, X, Y, CURVATURE_U, -1, CURVATURE_V, BACKGROUND)
 _SINGULAR = np.float32(1e-6)
-_N_MATRIX = 28
+_FREE_OF = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Powers of u and v in the derivatives by amplitude, centre, P, S and Q, beside E."""
+
+HESSIAN, NEWTON, GRADIENT, LOW, HIGH, FREE, STEP, PULL = 0, 28, 56, 63, 70, 77, 84, 91
+USE_NEWTON, SOLVED, N_SYSTEM = 98, 99, 100
+"""Rows of the equations of a step.
+
+J^T J of Gauss and Newton; the same with the second derivatives, which converges fast where noise is strong; the
+gradient of half the residual's sum of squares; the limits of the step; 1, or 0 where a parameter stays, or goes just
+to its limit; the step; the equations' right side; whether Newton's matrix is taken; whether there
+is a solution.
+"""
 
 
-def _products() -> Array:
-    """Return where each product of (E, E u, E v, E u^2, E u v, E v^2, 1) stands in the sums, as a lower triangle."""
-    powers = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
-    rows = [SQUARED + moment(i + k, j + n) for a, (i, j) in enumerate(powers) for k, n in powers[: a + 1]]
-    return np.array(rows + [FIRST + moment(i, j) for i, j in powers] + [WEIGHT])
-
-
-PRODUCTS = _products()
-
-XX, XY, YY, _SS = 2, 4, 5, 14
-"""Elements of a symmetric matrix."""
-
-_WITH_X, _WITH_Y = np.array([1, 7, 11, 16, 22]), np.array([3, 8, 12, 17, 23])
-"""The same of x, or y, with the other parameters."""
-
-
-class System(NamedTuple):
-    """The normal equations of a step in (amplitude, x, y, P, S, Q, background), its limits, and the step itself."""
-
-    sums: Any
-    """Moments along the ellipse's axes."""
-    hessian: Any
-    """(28,) J^T J, of Gauss and Newton."""
-    newton: Any
-    """(28,) with the second derivatives as well: where noise is strong, only this one converges fast."""
-    gradient: Any
-    """(7,) of half the residual's sum of squares."""
-    low: Any
-    high: Any
-    """(7,) limits of the step."""
-    free: Any
-    """(7,) 1, or 0 where the parameter stays, or goes just to its limit."""
-    step: Any
-    """(7,)."""
-    factor: Any
-    """(28,) room."""
-    scale: Any
-    pull: Any
-    """(7,) room."""
-
-
-N_SYSTEM = N_ROOM + 84 + 49
-"""Rows of a system."""
-
-
-@njit(**INNER)
-def system_in(room: Any) -> System:
-    """Return a system in ``N_SYSTEM`` rows."""
-    matrices, rows = room + N_ROOM, room + (N_ROOM + 84)
-    return System(
-        room,
-        matrices,
-        matrices + 28,
-        rows,
-        rows + 7,
-        rows + 14,
-        rows + 21,
-        rows + 28,
-        matrices + 56,
-        rows + 35,
-        rows + 42,
-    )
-
-
-@njit(**INNER)
 def entry(i: int, j: int) -> int:
     """Return where the element (i, j) of a symmetric matrix is stored."""
     high, low = max(i, j), min(i, j)
-    return (high * (high + 1) >> 1) + low
+    return high * (high + 1) // 2 + low
 
 
-@njit(**INNER)
-def assemble(point: Any, sums: Any, system: System) -> None:
-    """Turn the moments (30,) at a point (8,) into the hessian and the gradient."""
-    own, hessian, newton, gradient = system.sums, system.hessian, system.newton, system.gradient
-    for row in range(opaque(WEIGHT + 1)):
-        store(own, row, load(sums, row))
-    amplitude, cos, sin = load(point, AMPLITUDE), load(point, COS), load(point, SIN)
-    scale_u, scale_v = sqrt(load(point, CURVATURE_U)), sqrt(load(point, CURVATURE_V))
-    centre, axes = (load(point, X), load(point, Y)), (cos, sin, scale_u, scale_v)
-    to_axes(own, opaque(TOTAL), centre, axes)
+def _product(i: int, j: int) -> int:
+    """Return where the product of (E, E u, E v, E u^2, E u v, E v^2, 1)'s elements i and j stands in the sums."""
+    if min(i, j) == 6:
+        return WEIGHT
+    if max(i, j) == 6:
+        return FIRST + moment(*_FREE_OF[min(i, j)])
+    (a, b), (c, d) = _FREE_OF[i], _FREE_OF[j]
+    return SQUARED + moment(a + c, b + d)
+
+
+PRODUCTS = {entry(i, j): _product(i, j) for i in range(7) for j in range(i + 1)}
+"""Where the sums hold the products that make the matrices."""
+
+
+def read(rows: Rows, first: int, n: int) -> list[Vector]:
+    """Return ``n`` rows."""
+    return [rows[first + i] for i in range(n)]
+
+
+def write(rows: Rows, first: int, values: list[Vector]) -> None:
+    """Write rows from the ``first`` on."""
+    for i, value in enumerate(values):
+        rows[first + i] = value
+
+
+def assemble(point: Rows, sums: Rows) -> tuple[list[Vector], list[Vector], list[Vector]]:
+    """Return J^T J, the same with second derivatives, and the gradient at a point (8,), given its sums."""
+    own = read(sums, 0, WEIGHT + 1)
+    amplitude, cos, sin = point[AMPLITUDE], point[COS], point[SIN]
+    scale_u, scale_v = sqrt(point[CURVATURE_U]), sqrt(point[CURVATURE_V])
+    to_axes(own, KINDS, (point[X], point[Y]), (cos, sin, scale_u, scale_v))
     by_shape = -0.5 * amplitude
     inverse = select(absolute(amplitude) > 1e-20, 1 / amplitude, 0)
-    store(system.scale, 0, 1)
-    store(system.scale, 1, amplitude)
-    store(system.scale, 2, amplitude)
-    store(system.scale, 3, by_shape)
-    store(system.scale, 4, negated(amplitude))
-    store(system.scale, 5, by_shape)
-    store(system.scale, 6, 1)
-    for i in range(opaque(7)):
-        factor = load(system.scale, i)
-        store(gradient, i, negated(factor * load(own, DATA + i if i < 6 else TOTAL)))
+    one = amplitude.of(1)
+    scale = [one, amplitude, amplitude, by_shape, -amplitude, by_shape, one]
+    gradient = [-(scale[i] * own[DATA + i if i < 6 else TOTAL]) for i in range(7)]
+    hessian, newton = [], []
+    for i in range(7):
         for j in range(i + 1):
-            here = entry(i, j)
-            scale = factor * load(system.scale, j)
-            value = scale * load(own, PRODUCTS[here])
-            store(hessian, here, value)
-            if 0 < i < 6:
-                value -= scale * inverse * load(own, DATA - SQUARED + PRODUCTS[here])
-            store(newton, here, value)
-    _bend_centre(newton, amplitude, (load(own, DATA), load(own, DATA + 1), load(own, DATA + 2)))
-    by_x, by_y = (scale_u * cos, negated(scale_v * sin)), (scale_u * sin, scale_v * cos)
+            product = PRODUCTS[entry(i, j)]
+            both = scale[i] * scale[j]
+            value = both * own[product]
+            hessian.append(value)
+            newton.append(value - both * inverse * own[DATA - SQUARED + product] if 0 < i < 6 else value)
+    s, su, sv = own[DATA : DATA + 3]
+    # the second derivatives of log(E) itself, all by the centre: -1 by u u, u by u P, v by u S, ...
+    for here, score in ((XX, -s), (YY, -s), (7, su), (11, sv), (12, su), (17, sv)):
+        newton[here] = newton[here] - amplitude * score
+    by_x, by_y = (scale_u * cos, -(scale_v * sin)), (scale_u * sin, scale_v * cos)
     turn_centre(hessian, by_x, by_y)
     turn_centre(newton, by_x, by_y)
-    u, v = load(gradient, 1), load(gradient, 2)
-    store(gradient, 1, by_x[0] * u + by_x[1] * v)
-    store(gradient, 2, by_y[0] * u + by_y[1] * v)
+    u, v = gradient[1:3]
+    gradient[1:3] = by_x[0] * u + by_x[1] * v, by_y[0] * u + by_y[1] * v
+    return hessian, newton, gradient
 
 
-@njit(**INNER)
-def _bend_centre(newton: Any, amplitude: Any, scores: Any) -> None:
-    """Add the second derivatives of log(E) itself, all by the centre: -1 by u u, u by u P, v by u S, ..."""
-    s, su, sv = scores
-    for here, score in ((XX, negated(s)), (YY, negated(s)), (7, su), (11, sv), (12, su), (17, sv)):
-        store(newton, here, load(newton, here) - amplitude * score)
+XX, XY, YY, _SS = entry(1, 1), entry(1, 2), entry(2, 2), entry(4, 4)
 
 
-@njit(**INNER)
-def turn_centre(hessian: Any, by_x: Any, by_y: Any) -> None:
+def turn_centre(matrix: list[Vector], by_x: Any, by_y: Any) -> None:
     """Replace rows 1, 2 of a matrix, which are for a centre moved along u, v, by those for x, y."""
-    xu, xv = by_x
-    yu, yv = by_y
-    uu, uv, vv = load(hessian, XX), load(hessian, XY), load(hessian, YY)
-    store(hessian, XX, xu * (xu * uu + 2 * xv * uv) + xv * xv * vv)
-    store(hessian, XY, xu * yu * uu + (xu * yv + xv * yu) * uv + xv * yv * vv)
-    store(hessian, YY, yu * (yu * uu + 2 * yv * uv) + yv * yv * vv)
-    for n in range(opaque(_WITH_X.size)):
-        u, v = load(hessian, _WITH_X[n]), load(hessian, _WITH_Y[n])
-        store(hessian, _WITH_X[n], xu * u + xv * v)
-        store(hessian, _WITH_Y[n], yu * u + yv * v)
+    (xu, xv), (yu, yv) = by_x, by_y
+    uu, uv, vv = matrix[XX], matrix[XY], matrix[YY]
+    matrix[XX] = xu * (xu * uu + 2 * xv * uv) + xv * xv * vv
+    matrix[XY] = xu * yu * uu + (xu * yv + xv * yu) * uv + xv * yv * vv
+    matrix[YY] = yu * (yu * uu + 2 * yv * uv) + yv * yv * vv
+    for other in (0, 3, 4, 5, 6):
+        of_x, of_y = entry(1, other), entry(2, other)
+        u, v = matrix[of_x], matrix[of_y]
+        matrix[of_x], matrix[of_y] = xu * u + xv * v, yu * u + yv * v
 
 
-@njit(**INNER)
-def set_limits(point: Any, bounds: Any, free_shape: Any, system: System) -> None:
-    """Write the limits of a step: the bounds, and nearer ones where the quadratic model is not to be believed.
-
-    Adds to the hessian the bounds' own curvature by S: an axis that is held on its bound leaves it by S^2 as the
-    ellipse turns. Where ``free_shape`` is 0, the shape stays.
-    """
-    low, high, gradient = system.low, system.high, system.gradient
-    for i in (0, 1, 2, 6):
-        value = load(point, ROW_OF[i])
-        store(low, i, load(bounds, LOWER + BOUND_OF[i]) - value)
-        store(high, i, load(bounds, UPPER + BOUND_OF[i]) - value)
-    u, v = load(point, CURVATURE_U), load(point, CURVATURE_V)
-    reach = 1 / sqrt(smaller(u, v))
-    for i in (1, 2):
-        store(low, i, larger(load(low, i), negated(reach)))
-        store(high, i, smaller(load(high, i), reach))
-    flattest, steepest = load(bounds, LOWER + 3), load(bounds, UPPER + 3)
-    for i, curvature in ((3, u), (5, v)):
-        store(low, i, free_shape * larger(flattest / curvature - 1, -0.75))
-        store(high, i, free_shape * smaller(steepest / curvature - 1, 3.0))
-    stuck = (u == v) & ((load(low, 3) >= 0) | (load(high, 3) <= 0))
-    limit = select(stuck, 0, 0.75 * free_shape)
-    store(low, 4, negated(limit))
-    store(high, 4, limit)
-    apart = larger(absolute(u - v), 1e-20)
-    stiffness = select(_outward(system, opaque(3)), absolute(load(gradient, 3)) * v, 0)
-    stiffness += select(_outward(system, opaque(5)), absolute(load(gradient, 5)) * u, 0)
-    stiffness = select(u == v, 0, 2 * stiffness / apart)
-    for matrix in (system.hessian, system.newton):
-        store(matrix, _SS, load(matrix, _SS) + stiffness)
-
-
-@njit(**INNER)
-def _outward(system: System, i: int) -> Any:
+def _outward(low: Vector, high: Vector, gradient: Vector) -> Mask:
     """Return where a parameter is on a bound, with its gradient pushing against it."""
-    gradient = load(system.gradient, i)
-    return ((load(system.low, i) >= 0) & (gradient > 0)) | ((load(system.high, i) <= 0) & (gradient < 0))
+    return ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
 
 
-@njit(**INNER)
-def factorise(system: System, use_newton: Any, damping: Any) -> Any:
-    """Write the Cholesky factor of the free parameters' matrix, scaled by the diagonal of J^T J, and damped.
+def limits(point: Rows, bounds: Rows, free_shape: Vector) -> tuple[list[Vector], list[Vector]]:
+    """Return the limits of a step: the bounds, and nearer ones where the quadratic model is not to be believed.
 
-    The factor's own diagonal is inverted. Returns where the matrix is positive.
+    Where ``free_shape`` is 0, the shape stays.
     """
-    free, factor, scale = system.free, system.factor, system.scale
-    for i in range(opaque(7)):
-        is_free = load(free, i) > 0
-        store(scale, i, select(is_free, 1 / sqrt(select(is_free, load(system.hessian, entry(i, i)), 1)), 0))
+    u, v = point[CURVATURE_U], point[CURVATURE_V]
+    low, high = [u] * 7, [u] * 7
+    reach = 1 / sqrt(smaller(u, v))
+    for i in (0, 1, 2, 6):
+        value = point[ROW_OF[i]]
+        low[i], high[i] = bounds[LOWER + BOUND_OF[i]] - value, bounds[UPPER + BOUND_OF[i]] - value
+        if i in (1, 2):
+            low[i], high[i] = larger(low[i], -reach), smaller(high[i], reach)
+    flattest, steepest = bounds[LOWER + 3], bounds[UPPER + 3]
+    for i, curvature in ((3, u), (5, v)):
+        low[i] = free_shape * larger(flattest / curvature - 1, -0.75)
+        high[i] = free_shape * smaller(steepest / curvature - 1, 3.0)
+    on_bound = (low[3] >= 0) | (high[3] <= 0)
+    high[4] = select(u.equals(v) & on_bound, 0, 0.75 * free_shape)
+    low[4] = -high[4]
+    return low, high
+
+
+def stiffness(point: Rows, low: list[Vector], high: list[Vector], gradient: list[Vector]) -> Any:
+    """Return the bounds' own curvature by S: an axis held on its bound leaves it by S^2 as the ellipse turns."""
+    u, v = point[CURVATURE_U], point[CURVATURE_V]
+    value = select(_outward(low[3], high[3], gradient[3]), absolute(gradient[3]) * v, 0)
+    value = value + select(_outward(low[5], high[5], gradient[5]), absolute(gradient[5]) * u, 0)
+    return select(u.equals(v), 0, 2 * value / larger(absolute(u - v), 1e-20))
+
+
+def factorise(matrix: list[Vector], diagonal: list[Vector], free: list[Vector], damping: Vector) -> Any:
+    """Return L, 1 / D and where D is positive, of L D L^T, the matrix of the free parameters.
+
+    ``damping`` times ``diagonal``, that of J^T J, is added. L is a lower triangle without its diagonal of ones. For a
+    parameter that is not free 1 / D is 0: nothing else is needed to leave it out.
+    """
+    lower: dict[tuple[int, int], Vector] = {}
+    times_d: dict[tuple[int, int], Vector] = {}
+    inverse: list[Vector] = []
     positive = damping >= 0
-    for j in range(opaque(7)):
-        for i in range(j, 7):
-            total = _element(system, use_newton, entry(i, j)) * load(scale, i) * load(scale, j)
-            if i == j:
-                total = select(load(free, i) > 0, total, 1) + damping
+    for j in range(7):
+        pivot, least = matrix[entry(j, j)] + damping * diagonal[j], _SINGULAR * diagonal[j]
+        for k in range(j):
+            pivot = pivot - lower[j, k] * times_d[j, k]
+        positive = positive & ((pivot > least) | (free[j] <= 0))
+        inverse.append(select(free[j] > 0, 1 / larger(pivot, least), 0))
+        for i in range(j + 1, 7):
+            value = matrix[entry(i, j)]
             for k in range(j):
-                total -= load(factor, entry(i, k)) * load(factor, entry(j, k))
-            if i > j:
-                store(factor, entry(i, j), total * load(factor, entry(j, j)))
-            else:
-                positive = positive & (total > _SINGULAR)
-                store(factor, entry(j, j), 1 / sqrt(larger(total, _SINGULAR)))
-    return positive
+                value = value - lower[i, k] * times_d[j, k]
+            times_d[i, j] = value
+            lower[i, j] = value * inverse[j]
+    return lower, inverse, positive
 
 
-@njit(**INNER)
-def _element(system: System, use_newton: Any, here: int) -> Any:
-    return select(use_newton, load(system.newton, here), load(system.hessian, here))
+def solve(factors: Any, values: list[Any]) -> list[Vector]:
+    """Return the solution of matrix * solution = values, with the matrix's factors; 0 where a parameter is not free.
 
-
-@njit(**INNER)
-def solve(factor: Any, values: Any) -> None:
-    """Replace ``values`` (7,) by the solution of matrix * solution = values, with the matrix's factor."""
-    for i in range(opaque(7)):
-        total = load(values, i)
-        for k in range(i):
-            total -= load(factor, entry(i, k)) * load(values, k)
-        store(values, i, total * load(factor, entry(i, i)))
-    for back in range(opaque(7)):
-        i = 6 - back
-        total = load(values, i)
-        for k in range(i + 1, 7):
-            total -= load(factor, entry(k, i)) * load(values, k)
-        store(values, i, total * load(factor, entry(i, i)))
-
-
-@njit(**INNER)
-def solve_bounded(system: System, try_newton: Any, damping: Any) -> Any:
-    """Write the damped step within its limits, and which parameters it leaves free; return where it has a solution.
-
-    Newton's matrix is taken where it is to be tried and positive, else that of Gauss and Newton.
+    Values may be None for 0, up to the first that is not.
     """
-    use_newton = try_newton
-    _release(system)
-    while True:
-        positive = factorise(system, use_newton, damping)
-        misled = use_newton & (select(positive, 1, vector(np.float32(0))) == 0)
-        if count(misled) > 0:
-            use_newton = use_newton & positive
-            _release(system)
-        elif count(_solve_free(system, use_newton) & positive) == 0:
-            return positive
+    lower, inverse, _ = factors
+    solution = list(values)
+    begin = next(i for i, value in enumerate(values) if value is not None)
+    for i in range(begin + 1, 7):
+        for k in range(begin, i):
+            product = lower[i, k] * solution[k]
+            solution[i] = -product if solution[i] is None else solution[i] - product
+    result: list[Any] = [None] * 7
+    for i in reversed(range(7)):
+        total = None if solution[i] is None else solution[i] * inverse[i]
+        for k in range(i + 1, 7):
+            product = lower[k, i] * result[k]
+            total = -product if total is None else total - product
+        result[i] = total
+    return result
 
 
-@njit(**INNER)
-def _release(system: System) -> None:
-    """Let every parameter free that is not pushed against its bound."""
-    for i in range(opaque(7)):
-        held = _outward(system, i) | (load(system.hessian, entry(i, i)) <= 0)
-        store(system.free, i, select(held, 0, vector(np.float32(1))))
-        store(system.pull, i, negated(load(system.gradient, i)))
-        store(system.step, i, 0)
+def release(system: Rows, where: Mask) -> None:
+    """Let every parameter free that is not pushed against its bound, in some lanes."""
+    for i in range(7):
+        gradient = system[GRADIENT + i]
+        held = _outward(system[LOW + i], system[HIGH + i], gradient) | (system[HESSIAN + entry(i, i)] <= 0)
+        system[FREE + i] = select(where, select(held, 0, system.constant(1)), system[FREE + i])
+        system[PULL + i] = select(where, -gradient, system[PULL + i])
+        system[STEP + i] = select(where, 0, system[STEP + i])
 
 
-@njit(**INNER)
-def _solve_free(system: System, use_newton: Any) -> Any:
-    """Solve for the free parameters; put those that cross their limits onto them; return where there were any."""
-    free, step, pull, room = system.free, system.step, system.pull, system.sums
-    for i in range(opaque(7)):
-        store(room, i, load(pull, i) * load(system.scale, i))
-    solve(system.factor, room)
-    crossing = load(free, 0) < 0
-    for i in range(opaque(7)):
-        is_free = load(free, i) > 0
-        value = load(room, i) * load(system.scale, i)
-        bounded = smaller(larger(value, load(system.low, i)), load(system.high, i))
-        crossed = is_free & ((value < load(system.low, i)) | (value > load(system.high, i)))
-        crossing = crossing | crossed
-        store(free, i, select(crossed, 0, load(free, i)))
-        store(step, i, select(is_free, bounded, load(step, i)))
-        if count(crossed) > 0:
-            _fix(system, use_newton, i, select(crossed, bounded, 0))
-    return crossing
+def solve_bounded(system: Rows, running: Mask, damping: Vector) -> Any:
+    """Solve for the free parameters; return where that has to be done again.
+
+    Parameters that cross their limits are put onto them, and the others' equations are told. Newton's matrix is taken
+    where it is to be tried and positive, else that of Gauss and Newton.
+    """
+    hessian = read(system, HESSIAN, 28)
+    use_newton = system[USE_NEWTON] > 0
+    matrix = [
+        select(use_newton, newton, other) for newton, other in zip(read(system, NEWTON, 28), hessian, strict=True)
+    ]
+    free, pull = read(system, FREE, 7), read(system, PULL, 7)
+    factors = factorise(matrix, [hessian[entry(i, i)] for i in range(7)], free, damping)
+    solution, positive = solve(factors, pull), factors[2]
+    misled = use_newton & ~positive
+    again = misled & ~positive & running
+    for i in range(7):
+        low, high = system[LOW + i], system[HIGH + i]
+        value = smaller(larger(solution[i], low), high)
+        is_free = free[i] > 0
+        crossed = is_free & positive & ((solution[i] < low) | (solution[i] > high))
+        again = again | (crossed & running)
+        system[STEP + i] = select(is_free, value, system[STEP + i])
+        system[FREE + i] = select(crossed, 0, free[i])
+        for j in range(7):
+            pull[j] = pull[j] - matrix[entry(i, j)] * select(crossed, value, 0)
+    write(system, PULL, pull)
+    system[USE_NEWTON] = select(positive, system[USE_NEWTON], 0)
+    system[SOLVED] = select(positive, system.constant(1), 0)
+    release(system, misled)
+    return again
 
 
-@njit(**INNER)
-def _fix(system: System, use_newton: Any, i: int, value: Any) -> None:
-    """Take what a parameter moves by into account for the others."""
-    for j in range(opaque(7)):
-        pull = load(system.pull, j) - _element(system, use_newton, entry(i, j)) * value
-        store(system.pull, j, pull)
-
-
-@njit(**INNER)
-def diagonal_axes(p: Any, s: Any, q: Any) -> Any:
+def diagonal_axes(p: Vector, s: Vector, q: Vector) -> tuple[Vector, Vector]:
     """Return (cos, sin) of the turn, by at most 45 degrees, that makes p u^2 + 2 s u v + q v^2 diagonal."""
     apart = p - q
     tangent = 2 * s / (absolute(apart) + sqrt(apart * apart + 4 * s * s) + 1e-30)
-    tangent = select(apart < 0, negated(tangent), tangent)
+    tangent = select(apart < 0, -tangent, tangent)
     cos = 1 / sqrt(1 + tangent * tangent)
     return cos, tangent * cos
 
 
-@njit(**INNER)
-def turn_axes(point: Any, curvatures: Any, turn: Any) -> None:
-    """Turn a point's axes by (cos, sin) and set its curvatures; keeps |sin| <= cos by exchanging axes."""
+def turned(point: Rows, curvatures: Any, turn: Any) -> list[Vector]:
+    """Return a point's axes turned by (cos, sin), as curvatures, cos and sin; keeps |sin| <= cos by exchanging axes."""
     u, v = curvatures
     by_cos, by_sin = turn
-    cos = load(point, COS) * by_cos - load(point, SIN) * by_sin
-    sin = load(point, SIN) * by_cos + load(point, COS) * by_sin
-    sin, cos = select(cos < 0, negated(sin), sin), absolute(cos)
+    cos = point[COS] * by_cos - point[SIN] * by_sin
+    sin = point[SIN] * by_cos + point[COS] * by_sin
+    sin, cos = select(cos < 0, -sin, sin), absolute(cos)
     exchange = absolute(sin) > cos
-    turned = select(sin > 0, negated(cos), cos)
-    cos, sin = select(exchange, absolute(sin), cos), select(exchange, turned, sin)
+    cos, sin = select(exchange, absolute(sin), cos), select(exchange, select(sin > 0, -cos, cos), sin)
     length = 1 / sqrt(cos * cos + sin * sin)
-    store(point, COS, cos * length)
-    store(point, SIN, sin * length)
-    store(point, CURVATURE_U, select(exchange, v, u))
-    store(point, CURVATURE_V, select(exchange, u, v))
+    return [select(exchange, v, u), select(exchange, u, v), cos * length, sin * length]
 
 
-@njit(**INNER)
-def move(point: Any, system: System, bounds: Any, free_shape: Any, trial: Any) -> None:
-    """Write the point after the step, within the bounds, and exactly on them where the step ends there."""
-    step = system.step
+def move(point: Rows, step: list[Vector], bounds: Rows, free_shape: Vector) -> list[Vector]:
+    """Return the point after a step, within the bounds, and exactly on them where the step ends there."""
+    trial = read(point, 0, N_PARAMETERS)
     for i in (0, 1, 2, 6):
-        row, by = ROW_OF[i], load(step, i)
-        value = load(point, row)
-        lower, upper = load(bounds, LOWER + BOUND_OF[i]), load(bounds, UPPER + BOUND_OF[i])
+        value, by = trial[ROW_OF[i]], step[i]
+        lower, upper = bounds[LOWER + BOUND_OF[i]], bounds[UPPER + BOUND_OF[i]]
         moved = select(by <= lower - value, lower, select(by >= upper - value, upper, value + by))
-        store(trial, row, smaller(larger(moved, lower), upper))
-    u, v = load(point, CURVATURE_U), load(point, CURVATURE_V)
-    store(trial, COS, load(point, COS))
-    store(trial, SIN, load(point, SIN))
-    lower, upper = load(bounds, LOWER + 3), load(bounds, UPPER + 3)
-    p, q, s = u * (1 + load(step, 3)), v * (1 + load(step, 5)), sqrt(u * v) * load(step, 4)
+        trial[ROW_OF[i]] = smaller(larger(moved, lower), upper)
+    u, v = trial[CURVATURE_U], trial[CURVATURE_V]
+    lower, upper = bounds[LOWER + 3], bounds[UPPER + 3]
+    p, q, s = u * (1 + step[3]), v * (1 + step[5]), sqrt(u * v) * step[4]
     cos, sin = diagonal_axes(p, s, q)
     by_turn = s * sin / cos
-    new_u, new_v = _bounded(p + by_turn, lower, upper), _bounded(q - by_turn, lower, upper)
-    fixed = free_shape <= 0
-    turn_axes(trial, (select(fixed, u, new_u), select(fixed, v, new_v)), (select(fixed, 1, cos), select(fixed, 0, sin)))
+    free = free_shape > 0
+    curvatures = (_bounded(p + by_turn, lower, upper), u), (_bounded(q - by_turn, lower, upper), v)
+    turn = select(free, cos, 1), select(free, sin, 0)
+    trial[CURVATURE_U : SIN + 1] = turned(point, [select(free, *pair) for pair in curvatures], turn)
+    return trial
 
 
-@njit(**INNER)
-def _bounded(curvature: Any, lower: Any, upper: Any) -> Any:
+def _bounded(curvature: Vector, lower: Vector, upper: Vector) -> Any:
     """Return the curvature within its bounds, exactly on one where only rounding keeps it off."""
-    near = np.float32(1e-6)
+    near = 1e-6
     return select(curvature <= lower * (1 + near), lower, select(curvature >= upper * (1 - near), upper, curvature))
 
 
-@njit(**INNER)
-def is_small(point: Any, system: System, tolerance: Any) -> Any:
-    """Return where the centre moves less than ``tolerance`` and the ellipse's outline less than ten times that."""
-    step = system.step
-    sigma_u, sigma_v = 1 / sqrt(load(point, CURVATURE_U)), 1 / sqrt(load(point, CURVATURE_V))
-    centre = larger(absolute(load(step, 1)), absolute(load(step, 2)))
-    wider = larger(absolute(load(step, 3)) * sigma_u, absolute(load(step, 5)) * sigma_v) * 0.5
-    turned = absolute(load(step, 4)) * sigma_u * sigma_v / (sigma_u + sigma_v)
-    return (centre < tolerance) & (larger(wider, turned) < 10 * tolerance)
+def length_px(point: Rows, step: list[Vector]) -> Any:
+    """Return how far a step moves the centre, or a tenth of how far it moves the ellipse's outline, if that is more."""
+    sigma_u, sigma_v = 1 / sqrt(point[CURVATURE_U]), 1 / sqrt(point[CURVATURE_V])
+    wider = larger(absolute(step[3]) * sigma_u, absolute(step[5]) * sigma_v) * 0.5
+    turned_by = absolute(step[4]) * sigma_u * sigma_v / (sigma_u + sigma_v)
+    return larger(larger(absolute(step[1]), absolute(step[2])), larger(wider, turned_by) * 0.1)

@@ -57,6 +57,43 @@ def add_frames(total: Pixels, frames: Pixels, shifts: Whole) -> None:
                 target[x] += source[x]
 
 
+@njit(cache=True, nogil=True)
+def add_tiles(
+    total: Pixels, pixels: Pixels, place: Whole, shape: tuple[int, int], targets: Whole, shifts: Whole
+) -> None:
+    """Add frames in tiles to sums of frames in the same tiles, each at its shift; what lies beyond is the edge pixel.
+
+    Parameters
+    ----------
+    total
+        (tiles, sums, tile rows, tile columns).
+    pixels
+        (tiles, frames, tile rows, tile columns); only the first frames, as many as there are targets, are added.
+    place
+        (rows, columns) which of the tiles lies there; -1 where it is missing, and adds nothing.
+    shape
+        Rows and columns of a frame.
+    targets, shifts
+        (frames,) the sum that a frame belongs to, and (frames, 2) its shift, (y, x) in px.
+    """
+    height, width = total.shape[2:]
+    across, inside = np.empty(width, np.int64), np.empty(width, np.int64)
+    for row, column in np.ndindex(place.shape):
+        if place[row, column] < 0:
+            continue
+        for k in range(targets.size):
+            sums = total[place[row, column], targets[k]]
+            for j in range(width):
+                x = min(max(column * width + j + shifts[k, 1], 0), shape[1] - 1)
+                across[j], inside[j] = x // width, x % width
+            for i in range(height):
+                y = min(max(row * height + i + shifts[k, 0], 0), shape[0] - 1)
+                for j in range(width):
+                    tile = place[y // height, across[j]]
+                    if tile >= 0:
+                        sums[i, j] += pixels[tile, k, y % height, inside[j]]
+
+
 def coverage(shape: tuple[int, ...], shifts: Whole) -> Whole:
     """Return how many frames of a shape, moved by shifts (frames, 2), cover each pixel of a sum of the same shape."""
     edges = np.zeros((shape[0] + 1, shape[1] + 1), np.int64)

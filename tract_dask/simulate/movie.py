@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import tifffile
@@ -18,7 +18,9 @@ import xarray as xr
 from ..errors import DestinationError, SettingsError
 from ..kernels.rendering import PoissonTable, draw_counts, poisson_table
 from ..schema import AXES, texts
-from .scene import Scene, moving_scene
+from .scene import moving_scene
+
+Image: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
 _CLASSIC_TIFF_BYTES = 2**32 - 2**25
 _SMALLEST_FIELD_PM = 1200.0
@@ -78,23 +80,13 @@ def simulate_movie(
     DestinationError
         Where the file cannot be written.
     """
-    _check("n_frames", n_frames, 1, 10**9)
-    _check("pixel_size_pm", pixel_size_pm, 0.1, 100.0)
+    check_movie(n_frames, pixel_size_pm, frame_time_s, dose, contrast, drift_px, jump_pm)
     _check("shortest side of the field in pm", min(shape) * pixel_size_pm, _SMALLEST_FIELD_PM, 1e6)
-    _check("frame_time_s", frame_time_s, 1e-12, 1e6)
-    _check("contrast", contrast, -0.2, 2.0)
-    _check("drift_px", drift_px, 0.0, 100.0)
-    _check("jump_pm", jump_pm, 0.0, 100.0)
-    vacuum = dose * (pixel_size_pm / 100.0) ** 2
-    _check("dose, as counts of a pixel of vacuum", vacuum, 0.0, 10_000.0 / (1 + abs(contrast)))
-
     rng = np.random.default_rng(seed)
-    drift = np.zeros((n_frames, 2))
-    drift[1:] = np.cumsum(rng.normal(0.0, drift_px, (n_frames - 1, 2)), axis=0)
+    drift = random_drift(n_frames, drift_px, rng)
+    vacuum = vacuum_counts(dose, pixel_size_pm)
     scene = moving_scene(shape, pixel_size_pm, vacuum, contrast, drift, jump_pm, rng)
-    draw = partial(_draw_frame, scene, poisson_table(*scene.limits), seed)
-    _write_tiff(Path(path), _ahead(draw, n_frames), (n_frames, *shape), pixel_size_pm, frame_time_s)
-    return _truth(scene).assign_attrs(
+    truth = movie_truth(shape, drift, scene.x, scene.y, scene.atoms, scene.surface.kind, scene.role).assign_attrs(
         pixel_size_pm=pixel_size_pm,
         frame_time_s=frame_time_s,
         shape=list(shape),
@@ -103,11 +95,99 @@ def simulate_movie(
         vacuum_counts=vacuum,
         seed=seed,
     )
+    write_movie(path, truth, scene.expected_counts, scene.limits)
+    return truth
 
 
-def _draw_frame(scene: Scene, table: PoissonTable, seed: int, frame: int) -> np.ndarray[Any, Any]:
+def check_movie(
+    n_frames: int,
+    pixel_size_pm: float,
+    frame_time_s: float,
+    dose: float,
+    contrast: float,
+    drift_px: float,
+    jump_pm: float,
+) -> None:
+    """Check the numbers of a movie that is to be simulated; raises SettingsError."""
+    _check("n_frames", n_frames, 1, 10**9)
+    _check("pixel_size_pm", pixel_size_pm, 0.1, 100.0)
+    _check("frame_time_s", frame_time_s, 1e-12, 1e6)
+    _check("contrast", contrast, -0.2, 2.0)
+    _check("drift_px", drift_px, 0.0, 100.0)
+    _check("jump_pm", jump_pm, 0.0, 100.0)
+    counts = vacuum_counts(dose, pixel_size_pm)
+    _check("dose, as counts of a pixel of vacuum", counts, 0.0, 10_000.0 / (1 + abs(contrast)))
+
+
+def vacuum_counts(dose: float, pixel_size_pm: float) -> float:
+    """Return the expected counts of a pixel of vacuum at a dose in electrons for one square angstrom and frame."""
+    return dose * (pixel_size_pm / 100.0) ** 2
+
+
+def random_drift(n_frames: int, drift_px: float, rng: np.random.Generator) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return a random walk (frame, axis) in px that begins at 0, with steps of standard deviation ``drift_px``."""
+    drift = np.zeros((n_frames, 2))
+    drift[1:] = np.cumsum(rng.normal(0.0, drift_px, (n_frames - 1, 2)), axis=0)
+    return drift
+
+
+def write_movie(
+    path: str | Path, truth: xr.Dataset, expected_counts: Callable[[int], Image], limits: tuple[float, float]
+) -> None:
+    """Write Poisson counts as an ImageJ TIFF.
+
+    Parameters
+    ----------
+    path
+        As :func:`simulate_movie`, which raises the same.
+    truth
+        Its attributes ``shape``, ``pixel_size_pm``, ``frame_time_s`` and ``seed`` are used, and its number of frames.
+    expected_counts
+        The noise-free image of a frame, called from several threads.
+    limits
+        Bounds of all expected counts.
+    """
+    n_frames, attributes = truth.sizes["frame"], truth.attrs
+    draw = partial(_draw_frame, expected_counts, poisson_table(*limits), attributes["seed"])
+    shape = (n_frames, *attributes["shape"])
+    _write_tiff(Path(path), _ahead(draw, n_frames), shape, attributes["pixel_size_pm"], attributes["frame_time_s"])
+
+
+def movie_truth(
+    shape: tuple[int, int],
+    drift: np.ndarray[Any, np.dtype[np.float64]],
+    x: np.ndarray[Any, Any],
+    y: np.ndarray[Any, Any],
+    atoms: np.ndarray[Any, Any],
+    kind: np.ndarray[Any, Any],
+    role: np.ndarray[Any, Any],
+) -> xr.Dataset:
+    """Return the truth as :func:`simulate_movie` does: of columns (frame, column) those inside frame 0."""
+    rows, columns = shape
+    inside = (np.abs(x[0] - (columns - 1) / 2) < columns / 2) & (np.abs(y[0] - (rows - 1) / 2) < rows / 2)
+    per_frame = ("frame", "column_id")
+    return xr.Dataset(
+        {
+            "x": (per_frame, x[:, inside], {"units": "px"}),
+            "y": (per_frame, y[:, inside], {"units": "px"}),
+            "atoms": (per_frame, atoms[:, inside]),
+            "drift": (("frame", "axis"), drift, {"units": "px"}),
+            "kind": ("column_id", texts(kind[inside])),
+            "role": ("column_id", texts(role[inside])),
+        },
+        coords={
+            "frame": np.arange(len(drift)),
+            "column_id": np.arange(1, int(inside.sum()) + 1),
+            "axis": texts(AXES),
+        },
+    )
+
+
+def _draw_frame(
+    expected_counts: Callable[[int], Image], table: PoissonTable, seed: int, frame: int
+) -> np.ndarray[Any, Any]:
     key = np.random.SeedSequence([seed, frame]).generate_state(1, np.uint64)[0]
-    counts: np.ndarray[Any, Any] = draw_counts(scene.expected_counts(frame), key, *table)
+    counts: np.ndarray[Any, Any] = draw_counts(expected_counts(frame), key, *table)
     return counts
 
 
@@ -168,27 +248,6 @@ def _write_tiff(
             error.strerror or str(error),
             "Choose another place",
         ) from error
-
-
-def _truth(scene: Scene) -> xr.Dataset:
-    rows, columns = scene.shape
-    inside = (np.abs(scene.x[0] - (columns - 1) / 2) < columns / 2) & (np.abs(scene.y[0] - (rows - 1) / 2) < rows / 2)
-    per_frame = ("frame", "column_id")
-    return xr.Dataset(
-        {
-            "x": (per_frame, scene.x[:, inside], {"units": "px"}),
-            "y": (per_frame, scene.y[:, inside], {"units": "px"}),
-            "atoms": (per_frame, scene.atoms[:, inside]),
-            "drift": (("frame", "axis"), scene.drift, {"units": "px"}),
-            "kind": ("column_id", texts(scene.surface.kind[inside])),
-            "role": ("column_id", texts(scene.role[inside])),
-        },
-        coords={
-            "frame": np.arange(len(scene.drift)),
-            "column_id": np.arange(1, int(inside.sum()) + 1),
-            "axis": texts(AXES),
-        },
-    )
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

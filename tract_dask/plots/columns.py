@@ -1,11 +1,11 @@
-"""Figures."""
+"""The summed image: with the columns that were found in it, and with its Fourier transform."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -15,27 +15,42 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
+from scipy import fft
 
-from . import schema
-from .schema import Status
-from .seeds import positions
+from .. import schema
+from ..schema import Status
+from ..seeds import positions
+from .base import (
+    COLOURS,
+    FEW,
+    FONT,
+    PAGE_INCHES,
+    SMALL,
+    new_figure,
+    outline,
+    points_per_px,
+    round_length,
+    save,
+    scale_bar,
+    show_sum,
+    spacing_px,
+    title,
+)
 
-COLOURS = ("#56B4E9", "#E69F00", "#2CC295", "#CC79A7", "#F0E442", "#D55E00", "#FFFFFF")
-"""One for each kind: the colour-blind can tell them apart, on grey too (after Okabe and Ito)."""
-
-DPI = 150
-_PNG = {"compress_level": 1}
-"""Noise does not compress: higher levels take three times as long for the same size."""
+_DPI = 150
 _SIDE_INCHES = 7.5
 _NARROW_INCHES = 3.6
 _LINE_INCHES = 0.24
 _LABEL_INCHES = 1.65
 _BAR_INCHES = 1.6
 _BAR_MARGIN = 0.015
-_FEW = 80
-"""Up to so many columns their IDs are written beside them."""
 _STATES = (("o", 1.0, ""), ("s", 0.95, "window leaves the image"), ("D", 0.8, "fit in doubt"))
 """Marker, relative size and legend of a sound fit, of one that could not be made, and of one with another flag."""
+
+_MOST_TRANSFORMED = 2048
+"""Of a larger image, the middle of so many pixels is transformed."""
+_STANDS_OUT = 6.0
+"""A spot stands out where its amplitude is so many times the median at its distance from the centre."""
 
 
 def plot_columns(summed: xr.Dataset, columns: xr.Dataset, path: str | Path | None = None) -> Figure:
@@ -64,11 +79,11 @@ def plot_columns(summed: xr.Dataset, columns: xr.Dataset, path: str | Path | Non
     per_line = max(1, int((width - _BAR_INCHES) / _LABEL_INCHES))
     strip = _LINE_INCHES * -(-len(legend) // per_line) + 0.12
     height = ny * scale + strip
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, ny * scale / height))
     axes.set_axis_off()
-    _show(axes, summed)
+    show_sum(axes, summed, _SIDE_INCHES, _DPI)
     _mark(axes, columns, 72 * scale)
     figure.legend(
         handles=legend,
@@ -83,41 +98,118 @@ def plot_columns(summed: xr.Dataset, columns: xr.Dataset, path: str | Path | Non
         columnspacing=1.2,
     )
     pixel_size = columns.attrs.get("pixel_size_pm") or summed.attrs.get("pixel_size_pm")
-    _scale_bar(
+    _strip_bar(
         figure.add_axes((0, 1 - strip / height, 1, strip / height)), nx, strip / scale, width / scale, pixel_size
     )
-    if path is not None:
-        options: dict[str, Any] = {"pil_kwargs": _PNG} if Path(path).suffix == ".png" else {}
-        figure.savefig(path, dpi=DPI, **options)
-    return figure
+    return save(figure, path, _DPI)
 
 
-def _show(axes: Axes, summed: xr.Dataset) -> None:
-    """Draw the summed image, in grey where it is exposed, with pixels of the movie as coordinates.
+def plot_sum(summed: xr.Dataset, path: str | Path | None = None, *, columns: xr.Dataset | None = None) -> Figure:
+    """Draw the summed image and the amplitude of its Fourier transform (Figure 1a and b of the paper).
 
-    A large image is first binned to about the figure's own pixels, which matplotlib would do at many times the cost.
+    Parameters
+    ----------
+    summed
+        From :func:`tract_dask.sum_image`.
+    columns
+        Columns to mark by circles, a colour for each kind; None: none.
+    path
+        Where to save the figure, in the format that its suffix names; None: nowhere.
+
+    Notes
+    -----
+    The image goes through a Hann window first, against the cross that its edges would make. Of the transform the part
+    is drawn in which spots stand out, on a logarithmic scale.
     """
-    exposed = (summed["exposure"] > 0).to_numpy()
-    image = np.where(exposed, summed["image"].to_numpy(), 0.0)
-    ny, nx = image.shape
-    step = max(1, round(max(ny, nx) / (_SIDE_INCHES * DPI)))
-    count = _block_sums(exposed, step)
-    shown = np.where(count > 0, _block_sums(image, step) / np.maximum(count, 1), np.nan)
-    known = shown[count > 0]
-    low, high = np.percentile(known, [0.5, 99.7]) if known.size else (0.0, 1.0)
-    below, right = step * np.array(shown.shape) - 0.5
-    grey = mpl.colormaps["gray"].with_extremes(bad="#c8d0d8")
-    axes.imshow(shown, cmap=grey, vmin=low, vmax=high, extent=(-0.5, right, below, -0.5))
-    axes.set(xlim=(-0.5, nx - 0.5), ylim=(ny - 0.5, -0.5))
+    schema.validate(summed, schema.SUM, "summed image")
+    pixel_size = summed.attrs.get("pixel_size_pm")
+    ny, nx = summed["image"].shape
+    aspect = float(np.clip(nx / ny, 0.4, 2.0))
+    tall = (PAGE_INCHES - 0.3) / (aspect + 1)
+    figure = new_figure(PAGE_INCHES, tall + 0.3)
+    image, transform = figure.subplots(1, 2, width_ratios=(aspect, 1))
+    show_sum(image, summed, tall * max(1.0, nx / ny))
+    scale_bar(image, pixel_size)
+    n_frames = summed.attrs.get("n_frames")
+    title(image, "a", f"Mean of {n_frames} frames" if n_frames else "Summed image")
+    if columns is not None:
+        _circle(image, schema.validate(columns, schema.COLUMNS, "columns"))
+    _show_transform(transform, summed, pixel_size)
+    return save(figure, path)
 
 
-def _block_sums(image: NDArray[Any], step: int) -> NDArray[np.float64]:
-    """Return the sums of blocks of ``step`` x ``step`` pixels; those at the right and the bottom may be smaller."""
-    ny, nx = (-(-size // step) for size in image.shape)
-    whole = np.zeros((ny * step, nx * step), image.dtype)
-    whole[: image.shape[0], : image.shape[1]] = image
-    rows = whole.reshape(ny, step, nx * step).sum(axis=1, dtype=np.float64)
-    return np.asarray(rows.reshape(ny, nx, step).sum(axis=2))
+def _circle(axes: Axes, columns: xr.Dataset) -> None:
+    """Draw a circle around each column, a colour for each kind, and a legend where there are kinds."""
+    places, kinds = positions(columns), schema.texts(columns["kind"].to_numpy())
+    diameter = float(np.clip(0.45 * spacing_px(columns) * points_per_px(axes), 2.5, 20))
+    for kind, colour in _kinds(columns).items():
+        some = kinds == kind
+        axes.scatter(
+            places[some, 0],
+            places[some, 1],
+            s=diameter**2,
+            facecolors="none",
+            edgecolors=colour,
+            linewidths=1.0,
+            path_effects=outline(2.0),
+            label=kind or None,
+        )
+    if any(kinds):
+        axes.legend(fontsize=SMALL, loc="upper left", framealpha=0.85, handletextpad=0.3, borderpad=0.3)
+
+
+def _show_transform(axes: Axes, summed: xr.Dataset, pixel_size_pm: float | None) -> None:
+    """Draw the middle of the Fourier transform, with a scale bar in 1/nm (1/px without a pixel size)."""
+    image = np.where(summed["exposure"] > 0, summed["image"], np.nan).astype(np.float32)
+    spans = (slice(max(0, (n - _MOST_TRANSFORMED) // 2), (n + _MOST_TRANSFORMED) // 2) for n in image.shape)
+    image = image[tuple(spans)]
+    mean = np.nanmean(image) if np.isfinite(image).any() else 0.0
+    faded = np.where(np.isnan(image), 0, image - mean) * np.outer(*(np.hanning(n) for n in image.shape))
+    amplitude = np.abs(fft.fftshift(fft.fft2(faded.astype(np.float32))))
+    ky, kx = (fft.fftshift(fft.fftfreq(n)) for n in image.shape)
+    reach = _reach_of_spots(amplitude, np.hypot(ky[:, None], kx))
+    rows, columns = (np.flatnonzero(np.abs(k) <= reach) for k in (ky, kx))
+    shown = np.log10(amplitude[np.ix_(rows, columns)] + 1e-9 * amplitude.max(initial=1e-30))
+    low, high = np.percentile(shown, [30, 99.97])
+    half_y, half_x = 0.5 / len(ky), 0.5 / len(kx)
+    extent = (
+        kx[columns[0]] - half_x,
+        kx[columns[-1]] + half_x,
+        ky[rows[-1]] + half_y,
+        ky[rows[0]] - half_y,
+    )
+    axes.imshow(shown, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="nearest")
+    axes.set_axis_off()
+    title(axes, "b", "Fourier transform, logarithmic")
+    unit = 1000 / pixel_size_pm if pixel_size_pm else 1.0  # cycles in a nm for one in a px
+    length = round_length(2 * reach * unit / 4)
+    left, bottom = extent[0] + 0.08 * reach, extent[2] - 0.1 * reach
+    axes.add_patch(
+        Rectangle((left, bottom), length / unit, 0.025 * reach, facecolor="white", edgecolor="black", linewidth=0.6)
+    )
+    axes.text(
+        left + length / unit / 2,
+        bottom - 0.02 * reach,
+        f"{length:g} {'nm' if pixel_size_pm else 'px'}$^{{-1}}$",
+        color="white",
+        fontsize=FONT,
+        ha="center",
+        va="bottom",
+        path_effects=outline(),
+    )
+
+
+def _reach_of_spots(amplitude: NDArray[Any], distance: NDArray[np.float64]) -> float:
+    """Return how far from the centre spots stand out, with a margin; cycles a px."""
+    ring = np.minimum((distance * 2 * min(amplitude.shape)).astype(int), min(amplitude.shape))
+    order = np.argsort(ring, axis=None)
+    starts = np.searchsorted(ring.ravel()[order], np.arange(ring.max() + 2))
+    sizes = amplitude.ravel()[order]
+    reach = 0.02
+    for number, (start, stop) in enumerate(pairwise(starts)):
+        if stop > start and sizes[start:stop].max() > _STANDS_OUT * np.median(sizes[start:stop]):
+            reach = max(reach, number / (2 * min(amplitude.shape)))
+    return float(min(1.5 * reach, 0.5))
 
 
 def _states(columns: xr.Dataset) -> NDArray[np.int64]:
@@ -180,7 +272,7 @@ def _mark(axes: Axes, columns: xr.Dataset, points_per_px: float) -> None:
                     linewidths=width,
                     path_effects=[withStroke(linewidth=width + 1.2, foreground="#000000b0")],
                 )
-    if len(places) > _FEW:
+    if len(places) > FEW:
         return
     right = axes.get_xlim()[1] - 30 / points_per_px
     for column, (x, y) in zip(columns["column_id"].to_numpy(), places, strict=True):
@@ -198,14 +290,12 @@ def _mark(axes: Axes, columns: xr.Dataset, points_per_px: float) -> None:
         )
 
 
-def _scale_bar(axes: Axes, nx: int, height: float, width: float, pixel_size_pm: float | None) -> None:
+def _strip_bar(axes: Axes, nx: int, height: float, width: float, pixel_size_pm: float | None) -> None:
     """Draw a bar of a round length, up to a sixth of the image, at the right of the strip above it; units are px."""
     axes.set_axis_off()
     axes.set(xlim=(0, width), ylim=(height, 0))
     nm_per_px = pixel_size_pm / 1000 if pixel_size_pm else 1.0
-    longest = nx * nm_per_px / 6
-    decade = 10.0 ** np.floor(np.log10(longest))
-    length = max(step * decade for step in (1, 2, 5) if step * decade <= longest)
+    length = round_length(nx * nm_per_px / 6)
     left, right = (1 - _BAR_MARGIN) * width - length / nm_per_px, (1 - _BAR_MARGIN) * width
     axes.add_patch(Rectangle((left, 0.44 * height), right - left, 0.12 * height, facecolor="black", edgecolor="none"))
     axes.text(

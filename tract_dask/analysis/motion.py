@@ -1,0 +1,219 @@
+"""Where the columns are, in picometres: positions, their spread, displacements, and the lattice that they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from .. import results, schema
+from ..errors import SettingsError
+from .sites import fit_sites
+
+
+def pixel_size_pm(tracks: xr.Dataset) -> float:
+    """Return the size of a pixel in pm.
+
+    Raises
+    ------
+    SettingsError
+        Where the tracks do not know it.
+    """
+    size = tracks.attrs.get("pixel_size_pm")
+    if not size:
+        raise SettingsError(
+            "the size of a pixel is not known",
+            "tracks.attrs['pixel_size_pm']",
+            "picometres for one pixel",
+            repr(size),
+            "Run again with --pixel-size-pm, or say tracks.assign_attrs(pixel_size_pm=4.0)",
+        )
+    return float(size)
+
+
+def positions(tracks: xr.Dataset) -> xr.DataArray:
+    """Return the drift-corrected places of the columns: their tracks.
+
+    Parameters
+    ----------
+    tracks
+        Results, from :func:`tract_dask.open_results`; only accepted fits count.
+
+    Returns
+    -------
+    DataArray
+        (frame, column_id, axis) in pm; NaN where a fit is not accepted. As lazy as the tracks.
+
+    Raises
+    ------
+    SettingsError
+        Where the size of a pixel is not known.
+    """
+    return _in_pm(tracks, "fit", "Place of the column, drift-corrected")
+
+
+def standard_errors(tracks: xr.Dataset) -> xr.DataArray:
+    """Return the standard errors of :func:`positions`, (frame, column_id, axis) in pm, as the fits state them."""
+    return _in_pm(tracks, "stderr", "Standard error of the place")
+
+
+def _in_pm(tracks: xr.Dataset, name: str, description: str) -> xr.DataArray:
+    scale = pixel_size_pm(tracks)
+    values = results.accepted(tracks)[name].sel(parameter=list(schema.AXES))
+    values = values.drop_vars(["parameter", "unit"], errors="ignore").rename(parameter="axis")
+    values = (values * scale).assign_coords(axis=schema.texts(schema.AXES))
+    return values.rename(None).assign_attrs(units="pm", long_name=description)
+
+
+def reference_positions(tracks: xr.Dataset) -> xr.DataArray:
+    """Return the places of the columns in the summed image, (column_id, axis) in pm."""
+    places = xr.concat([tracks[f"{axis}_ref"] for axis in schema.AXES], dim="axis").transpose("column_id", "axis")
+    places = (places * pixel_size_pm(tracks)).assign_coords(axis=schema.texts(schema.AXES))
+    return places.rename(None).assign_attrs(units="pm", long_name="Place of the column in the summed image")
+
+
+def spread(tracks: xr.Dataset) -> xr.Dataset:
+    """Return how far each column spreads about its mean place: the precision, for a column that keeps still.
+
+    Parameters
+    ----------
+    tracks
+        Results; only accepted fits count.
+
+    Returns
+    -------
+    Dataset
+        Over column_id, in pm and as lazy as the tracks: ``sd_x``, ``sd_y`` (of a sample, n - 1), ``sd`` per axis, the
+        root mean square of both, ``sd_radial``, the root of the sum of their squares, and ``mean_displacement``, the
+        mean distance from the place in the summed image, which the original calls RMSD. ``n``: accepted frames.
+
+    Notes
+    -----
+    Figure 4 of the paper. For a column that keeps still, with the same normal error σ along both axes,
+    ``sd`` = σ, ``sd_radial`` = √2 σ and ``mean_displacement`` = √(π/2) σ.
+    """
+    place = positions(tracks)
+    deviation = place.std("frame", ddof=1)
+    sd_y, sd_x = (deviation.sel(axis=axis, drop=True) for axis in schema.AXES)
+    radial = _length(deviation)
+    away = _length(place - reference_positions(tracks)).mean("frame")
+    found = {
+        "sd_x": (sd_x, "Standard deviation along x"),
+        "sd_y": (sd_y, "Standard deviation along y"),
+        "sd": (radial / np.sqrt(2), "Standard deviation per axis, root mean square of x and y"),
+        "sd_radial": (radial, "Standard deviation in the plane"),
+        "mean_displacement": (away, "Mean distance from the place in the summed image"),
+    }
+    spreads = xr.Dataset({name: named(values, "pm", text) for name, (values, text) in found.items()})
+    spreads["n"] = named(place.notnull().all("axis").sum("frame"), "1", "Accepted frames")
+    return spreads
+
+
+def displacement(tracks: xr.Dataset, first: int, second: int) -> xr.Dataset:
+    """Return how far each column moved from one frame to another, and how sure that is.
+
+    Parameters
+    ----------
+    tracks
+        Results; only accepted fits count.
+    first, second
+        Frames, as the coordinate ``frame`` numbers them.
+
+    Returns
+    -------
+    Dataset
+        Over column_id: ``displacement`` (column_id, axis) with its ``stderr``, ``distance``, all in pm, and
+        ``p_value``, the probability of such a displacement in units of its error, or a larger one, for a column that
+        keeps still: exp(-χ²/2), with χ² the sum of both axes' squares. NaN where a fit is not accepted.
+
+    Raises
+    ------
+    SettingsError
+        Where there is no such frame.
+
+    Notes
+    -----
+    The errors are those of the fits, without that of the drift, which moves all columns alike. The paper compares
+    displacements with the spread of columns that keep still (section 3.2, Figure 3); for that use :func:`spread`.
+    """
+    frames = tracks["frame"].to_numpy()
+    for frame in (first, second):
+        if frame not in frames:
+            raise SettingsError(
+                "there is no such frame", "displacement", f"a frame from {frames[0]} to {frames[-1]}", f"{frame}"
+            )
+    place, error = (values.sel(frame=[first, second]) for values in (positions(tracks), standard_errors(tracks)))
+    moved = place.isel(frame=1, drop=True) - place.isel(frame=0, drop=True)
+    stderr = (error**2).sum("frame", skipna=False) ** 0.5
+    chi_squared = ((moved / stderr) ** 2).sum("axis", skipna=False)
+    return xr.Dataset(
+        {
+            "displacement": named(moved, "pm", f"Displacement from frame {first} to frame {second}"),
+            "distance": named(_length(moved), "pm", "Length of the displacement"),
+            "stderr": named(stderr, "pm", "Standard error of the displacement"),
+            "p_value": named(xr.ufuncs.exp(-chi_squared / 2), "1", "Probability of as much or more without motion"),
+        },
+        attrs={"first": first, "second": second},
+    )
+
+
+def named(values: xr.DataArray, unit: str, description: str) -> xr.DataArray:
+    """Return values with their unit and a sentence that says what they are, and no other attributes."""
+    values = values.copy(deep=False)
+    values.attrs = {"units": unit, "long_name": description}
+    return values
+
+
+def _length(vectors: xr.DataArray) -> xr.DataArray:
+    return (vectors**2).sum("axis", skipna=False) ** 0.5
+
+
+def lattice_displacement(tracks: xr.Dataset, columns: Sequence[int] | None = None) -> xr.Dataset:
+    """Return how far each column is from its site on a lattice fitted to the mean places.
+
+    The lattice has one pair of vectors, and one origin for each ``kind`` of column (sublattice). It is fitted by least
+    squares; columns farther than four robust standard deviations from their sites do not count.
+
+    Parameters
+    ----------
+    tracks
+        Results; only accepted fits count.
+    columns
+        IDs of the columns to fit the lattice to, such as those well below the surface; None: all.
+
+    Returns
+    -------
+    Dataset
+        ``displacement`` (frame, column_id, axis) from the site, as lazy as the tracks; ``mean_displacement`` and
+        ``site`` (column_id, axis); ``distance`` (column_id), the length of the mean displacement; ``index`` (column_id,
+        direction), the site's number along both vectors; ``fitted`` (column_id), whether the column counted; ``vector``
+        and ``vector_stderr`` (direction, axis). Lengths in pm.
+
+    Raises
+    ------
+    SettingsError
+        Where the columns do not make a lattice.
+    """
+    place = positions(tracks)
+    mean = place.mean("frame").compute()
+    kinds = schema.texts(tracks["kind"].to_numpy()).astype(str)
+    chosen = np.ones(len(kinds), bool) if columns is None else np.isin(tracks["column_id"].to_numpy(), columns)
+    found = fit_sites(mean.to_numpy(), kinds, chosen)
+    site = xr.zeros_like(mean) + found.site
+    directions = {"direction": schema.texts(("a", "b"))}
+    vector = xr.DataArray(found.vectors, directions | {"axis": mean["axis"].to_numpy()}, ("direction", "axis"))
+    index = xr.DataArray(found.index, {"column_id": mean["column_id"], **directions}, ("column_id", "direction"))
+    fitted = xr.DataArray(found.fitted, {"column_id": mean["column_id"]}, ("column_id",))
+    return xr.Dataset(
+        {
+            "displacement": named(place - site, "pm", "Displacement from the lattice site"),
+            "mean_displacement": named(mean - site, "pm", "Mean displacement from the lattice site"),
+            "distance": named(_length(mean - site), "pm", "Length of the mean displacement"),
+            "site": named(site, "pm", "Lattice site"),
+            "index": named(index, "1", "Number of the site along both vectors of the lattice"),
+            "fitted": named(fitted, "1", "Whether the lattice was fitted to the column"),
+            "vector": named(vector, "pm", "Vectors of the lattice"),
+            "vector_stderr": named(vector.copy(data=found.stderr), "pm", "Standard errors of the vectors"),
+        }
+    )

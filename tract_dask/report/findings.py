@@ -1,0 +1,256 @@
+"""What a reader has to know before trusting the tracks, in plain words: each with its numbers and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schema import AXES
+from .survey import Survey
+
+LOW_SHARE = 0.9
+"""Fewer accepted fits than this share of all that were made are worth a warning."""
+HALF = 0.5
+"""A column, or a frame, with a smaller share of accepted fits is named."""
+AT_BOUND = 0.02
+"""Fits that may end on a bound, as a share of all."""
+UNSETTLED = 0.01
+"""Fits that may fail to converge, as a share of all."""
+SHAPES_AT_BOUND = 0.1
+FACTOR = 0.8, 1.25
+"""Between these, the scatter of the places from frame to frame agrees with the errors of the fits."""
+LONG_DRIFT = 0.1
+"""A drift over a larger share of the image's side leaves columns near its edges unseen for long."""
+LONG_STEP = 0.4
+"""A step of the drift beyond this share of the columns' distance may have been mistaken by a whole period."""
+POOR_QUALITY = 0.5
+"""A frame that correlates with the sum by less than this share of the usual is named."""
+RESIDUAL = 0.15
+"""Residual of a fit on the summed image, as a share of the amplitude, that is worth a look."""
+_NAMED = 10
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something to know.
+
+    Attributes
+    ----------
+    name
+        What kind of finding it is.
+    title
+        In a few words.
+    text
+        With its numbers.
+    remedy
+        What can be done.
+    serious
+        Whether it is a warning; otherwise it is only good to know.
+    """
+
+    name: str
+    title: str
+    text: str
+    remedy: str = ""
+    serious: bool = True
+
+
+def findings(run: Survey) -> list[Finding]:
+    """Return what there is to know of a run, warnings first."""
+    checks = (_calibration, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
+    found = [finding for check in checks for finding in check(run)]
+    return sorted(found, key=lambda finding: not finding.serious)
+
+
+def named(numbers: Iterable[int]) -> str:
+    """Return numbers for a sentence, the first few of them.
+
+    Examples
+    --------
+    >>> named([3, 4, 9]), named([7]), named(range(12))
+    ('3, 4 and 9', '7', '0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 2 more')
+    """
+    every = [str(number) for number in numbers]
+    first, rest = every[:_NAMED], every[_NAMED:]
+    last = f"{len(rest)} more" if rest else first.pop() if first else ""
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def count(number: int, what: str) -> str:
+    """Return a number of things, in the singular or the plural.
+
+    Examples
+    --------
+    >>> count(1, "frame"), count(12_000, "frame")
+    ('1 frame', '12,000 frames')
+    """
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def _calibration(run: Survey) -> Iterator[Finding]:
+    known = run.tracks.attrs
+    if run.unit == "px":
+        text = "The movie does not say how large a pixel is, so all lengths here are in pixels."
+        yield Finding(
+            "pixel_size", "The pixel size is not known", text, "Run the same command again with --pixel-size-pm."
+        )
+    if not known.get("frame_time_s"):
+        text = "The movie does not say how long a frame lasts, so time is counted in frames."
+        remedy = "Run the same command again with --frame-time-s."
+        yield Finding("frame_time", "The frame time is not known", text, remedy, serious=False)
+
+
+def _acceptance(run: Survey) -> Iterator[Finding]:
+    if not run.fits or run.accepted >= LOW_SHARE * run.fits:
+        return
+    reasons = {
+        "the amplitude is not above the noise": "below_noise",
+        "the fit did not settle": "not_converged",
+        "the position or the amplitude ended on its bound": "at_bound",
+    }
+    numbers = {reason: int(run.columns[flag].sum()) for reason, flag in reasons.items()}
+    reason = max(numbers, key=lambda reason: numbers[reason])
+    text = (
+        f"{run.accepted:,} of {run.fits:,} fits ({run.accepted / run.fits:.1%}) were accepted. The usual reason "
+        f"against one: {reason} ({numbers[reason]:,} fits)."
+    )
+    remedy = "Look at which columns and frames they are, below; sum frames (rebin_frames) where the dose is too low."
+    yield Finding("accepted", "Few fits were accepted", text, remedy)
+
+
+def _columns(run: Survey) -> Iterator[Finding]:
+    columns, ids = run.columns, run.columns["column_id"].to_numpy()
+    weak = columns["share"].to_numpy() < HALF
+    if weak.any():
+        text = f"Fewer than half of the fits were accepted for {_of_columns(ids[weak])}."
+        remedy = "Is there a column in the summed image? If not, remove it from columns.csv and run again."
+        yield Finding("weak_columns", "Some columns are seldom there, or too weak", text, remedy)
+    n_frames = run.frames.sizes["frame"]
+    outside = columns["outside"].to_numpy()
+    never, sometimes = outside == n_frames, (outside > 0) & (outside < n_frames)
+    if never.any():
+        text = f"The window of {_of_columns(ids[never])} leaves the image in every frame: nothing was fitted."
+        remedy = "A smaller window (--window-px) reaches closer to the edge."
+        yield Finding("never_fitted", "Columns at the edge were not fitted", text, remedy)
+    if sometimes.any():
+        text = f"The window of {_of_columns(ids[sometimes])} leaves the image in some frames, as the specimen drifts."
+        yield Finding("at_the_edge", "Columns near the edge are missing at times", text, serious=False)
+    poor = columns["residual"].to_numpy() > RESIDUAL
+    if poor.any():
+        text = (
+            f"In the summed image the fit leaves more than {RESIDUAL:.0%} of the amplitude (rms) for "
+            f"{_of_columns(ids[poor])}: a neighbour reaches into the window, or the column is not a Gaussian."
+        )
+        remedy = "See the residuals below; a smaller window (--window-px) keeps neighbours out."
+        yield Finding("residual", "Some columns do not look like Gaussians", text, remedy)
+
+
+def _of_columns(ids: NDArray[np.int64]) -> str:
+    return f"{count(len(ids), 'column')} ({named(ids.tolist())})"
+
+
+def _frames(run: Survey) -> Iterator[Finding]:
+    frames = run.frames["frame"].to_numpy()
+    bad = run.frames["bad"].to_numpy()
+    if bad.any():
+        text = f"{count(int(bad.sum()), 'frame')} ({named(frames[bad].tolist())}) have pixels that are NaN or infinite."
+        yield Finding("bad_frames", "Frames could not be fitted", text, "Look at them in the movie.")
+    poor = ~bad & (run.frames["share"].to_numpy() < HALF)
+    if poor.any():
+        text = (
+            f"In {count(int(poor.sum()), 'frame')} ({named(frames[poor].tolist())}) fewer than half of the fits were "
+            "accepted."
+        )
+        remedy = "Is the specimen blurred, out of focus, or out of sight there?"
+        yield Finding("poor_frames", "Some frames are worse than the others", text, remedy)
+
+
+def _flags(run: Survey) -> Iterator[Finding]:
+    if not run.fits:
+        return
+    share = {name: int(run.columns[name].sum()) / run.fits for name in ("at_bound", "not_converged", "shape_at_bound")}
+    if share["at_bound"] > AT_BOUND:
+        text = f"{share['at_bound']:.1%} of all fits ended on a bound of position, amplitude or background."
+        remedy = "Columns move farther than --max-shift-px, neighbours are taken for them, or they are not there."
+        yield Finding("at_bound", "Many fits ended on a bound", text, remedy)
+    if share["not_converged"] > UNSETTLED:
+        text = f"{share['not_converged']:.1%} of all fits did not settle."
+        yield Finding(
+            "not_converged", "Many fits did not settle", text, "Usually the dose is too low for these columns."
+        )
+    if share["shape_at_bound"] > SHAPES_AT_BOUND:
+        text = (
+            f"In {share['shape_at_bound']:.1%} of all fits a free width ended on its bound; their places are accepted."
+        )
+        remedy = "--shape fixed takes the widths of the summed image."
+        yield Finding("shape_at_bound", "Widths are not well determined", text, remedy, serious=False)
+
+
+def _errors(run: Survey) -> Iterator[Finding]:
+    if run.accepted and not np.isfinite(run.columns["expected"]).any():
+        text = "The fits state no errors of the positions; after the filters wiener and tv-l1 they are not known."
+        yield Finding(
+            "no_errors", "No errors are known", text, "Take the spread of columns that keep still.", serious=False
+        )
+    if np.isfinite(run.factor) and run.frames.sizes["frame"] > 2 and not FACTOR[0] <= run.factor <= FACTOR[1]:
+        more = run.factor > 1
+        text = (
+            f"From frame to frame the places scatter {run.factor:.2f} times as much as the errors of the fits say "
+            "(median over the columns)."
+        )
+        remedy = (
+            "Columns move, drift is left over, or the noise is not that of counts (--gain, --no-counting)."
+            if more
+            else "The noise is smaller than that of counts: check --gain, or say --no-counting."
+        )
+        yield Finding("scatter", "The stated errors do not fit the scatter", text, remedy)
+
+
+def _drift(run: Survey) -> Iterator[Finding]:
+    drift = run.frames["drift"].to_numpy()
+    side = np.array(run.summed["image"].shape)
+    span = np.ptp(drift, axis=0) if len(drift) else np.zeros(2)
+    if (span > LONG_DRIFT * side).any():
+        axis = int(np.argmax(span / side))
+        text = f"Along {AXES[axis]} it spans {span[axis]:.0f} px, {span[axis] / side[axis]:.0%} of the image."
+        yield Finding(
+            "long_drift", "The drift is long", text, "Columns near the edges are seen in part of the frames only."
+        )
+    spacing = run.tracks.attrs["window_px"] * 2.0 if (found := _spacing(run)) is None else found
+    step = np.hypot(*np.diff(run.frames["drift_measured"].to_numpy(), axis=0).T) if len(drift) > 1 else np.zeros(1)
+    if (step > LONG_STEP * spacing).any():
+        far = run.frames["frame"].to_numpy()[1:][step > LONG_STEP * spacing]
+        text = (
+            f"The longest step from one frame to the next is {step.max():.1f} px, with columns {spacing:.0f} px apart: "
+            f"it may be wrong by a whole period (frames {named(far.tolist())})."
+        )
+        yield Finding("long_step", "The drift jumps", text, "Look at these frames, or give the drift (--drift-csv).")
+    if "quality" in run.frames:
+        quality = run.frames["quality"].to_numpy()
+        poor = quality < POOR_QUALITY * np.nanmedian(quality)
+        if poor.any():
+            text = (
+                f"{count(int(poor.sum()), 'frame')} ({named(run.frames['frame'].to_numpy()[poor].tolist())}) resemble "
+                f"the sum far less than the others (correlation below {POOR_QUALITY * np.nanmedian(quality):.2f})."
+            )
+            yield Finding("poor_drift", "The drift of some frames is not sure", text, "Look at them in the movie.")
+
+
+def _spacing(run: Survey) -> float | None:
+    """Return the columns' distance from their neighbours, px."""
+    from ..windows import neighbour_distance
+
+    return neighbour_distance(np.stack([run.columns["x_ref"], run.columns["y_ref"]], axis=1))
+
+
+def _told(run: Survey) -> Iterator[Finding]:
+    """Repeat what the last run said itself."""
+    starts = [number for number, event in enumerate(run.events) if event.get("event") == "RunStarted"]
+    for event in run.events[starts[-1] if starts else 0 :]:
+        if event.get("event") == "Warned":
+            yield Finding(
+                "told", "The run said", f"{event['message'][:1].upper()}{event['message'][1:]}.", serious=False
+            )

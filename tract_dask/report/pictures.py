@@ -1,0 +1,65 @@
+"""Pictures for a page: figures and images as data that stand in the page itself."""
+
+from __future__ import annotations
+
+import io
+from base64 import b64encode
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+
+_QUALITY = 88
+
+
+def figure_data(figure: Figure, dpi: float) -> str:
+    """Return a figure as a data URL (WebP)."""
+    file = io.BytesIO()
+    figure.savefig(file, format="webp", dpi=dpi, pil_kwargs={"quality": _QUALITY})
+    return _url(file.getvalue(), "webp")
+
+
+def windows_data(shown: NDArray[np.float64]) -> str:
+    """Return the image, the model and the residual of a column side by side as a data URL (PNG).
+
+    Parameters
+    ----------
+    shown
+        (3, window, window), NaN beyond the disc. Image and model have the same greys; the residual is blue where it is
+        negative and red where it is positive, full colour at a quarter of the range of the image.
+    """
+    image, model, residual = shown
+    low, high = np.nanmin([image, model]), np.nanmax([image, model])
+    span = high - low or 1.0
+    grey, signed = mpl.colormaps["gray"], mpl.colormaps["RdBu_r"]
+    panels = [grey((image - low) / span), grey((model - low) / span), signed(0.5 + 2 * residual / span)]
+    gap = np.zeros((len(image), 2, 4))
+    beyond = ~np.isfinite(image)
+    for panel in panels:
+        panel[beyond] = 0.0
+    file = io.BytesIO()
+    imsave(file, np.concatenate([panels[0], gap, panels[1], gap, panels[2]], axis=1), format="png")
+    return _url(file.getvalue(), "png")
+
+
+def _url(data: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{b64encode(data).decode('ascii')}"
+
+
+def grey_levels(image: NDArray[Any], exposed: NDArray[np.bool_], longest: int) -> NDArray[np.uint8]:
+    """Return an image (y, x) as grey levels 1 to 255, binned to ``longest`` pixels at most; 0: not exposed."""
+    step = max(1, -(-max(image.shape) // longest))
+    ny, nx = (-(-size // step) * step for size in image.shape)
+    padding = ((0, ny - image.shape[0]), (0, nx - image.shape[1]))
+    blocks = [
+        np.pad(part, padding).reshape(ny // step, step, nx // step, step).sum(axis=(1, 3))
+        for part in (np.where(exposed, image, 0.0), exposed.astype(float))
+    ]
+    mean = np.divide(blocks[0], blocks[1], out=np.full_like(blocks[0], np.nan), where=blocks[1] > 0)
+    known = mean[np.isfinite(mean)]
+    low, high = np.percentile(known, [0.5, 99.7]) if known.size else (0.0, 1.0)
+    level = 1 + 254 * np.clip((mean - low) / ((high - low) or 1.0), 0, 1)
+    return np.where(np.isfinite(mean), np.nan_to_num(level), 0).astype(np.uint8)
