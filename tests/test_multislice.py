@@ -291,6 +291,7 @@ def test_command_writes_a_movie_and_its_truth(tmp_path):
         (("image", "x.tif", "--pixel-size-pm", "1000"), ["pixel_size_pm", "0.5 to 100"]),
         (("movie", "x.tif", "--structure", "none.cif"), ["--model multislice"]),
         (("image", "x.tif", "--vibration-pm", "-1"), ["vibration_pm", "at least 0"]),
+        (("image", "x.tif", "--zone-axis", "0,0,1"), ["zone_axis", "structure file"]),
     ],
 )
 def test_bad_input_is_explained_before_work(ase, command, words, tmp_path, monkeypatch):

@@ -42,7 +42,7 @@ def plot_filters(images: xr.DataArray, compared: xr.Dataset, path: str | Path | 
     filters = [str(name) for name in images["filter"].to_numpy()]
     ny, nx = images.shape[1:]
     width = PAGE_INCHES / len(filters)
-    tall = width * ny / nx + 0.25
+    tall = width * ny / nx + 0.4
     figure = new_figure(PAGE_INCHES, tall + _PROFILE_INCHES)
     parts: Any = figure.subfigures(2, 1, height_ratios=(tall, _PROFILE_INCHES))
     above, below = parts

@@ -59,6 +59,14 @@ def specimen_of(settings: SpecimenSettings, *, even: bool = False) -> Specimen:
         As :func:`block` and :func:`read_structure`.
     """
     if settings.structure == "ceo2":
+        if settings.zone_axis or settings.up:
+            raise SettingsError(
+                "ceo2 has its own directions",
+                "zone_axis, up",
+                "none: it is seen along [110], with (111) upwards",
+                f"{settings.zone_axis}, {settings.up}",
+                "Give a structure file to choose them",
+            )
         return ceria_slab(settings.n_periods) if even else ceria_step(settings.height_pm, settings.width_pm)
     crystal = read_structure(Path(settings.structure))
     zone_axis = settings.zone_axis
