@@ -16,6 +16,7 @@ RUN = STAGES | {"cluster", "stages", "pipeline"}
 
 ALLOWED = {
     "errors": set(),
+    "lazy": set(),
     "progress": set(),
     "schema": {"errors"},
     "settings": {"errors"},
@@ -37,7 +38,7 @@ ALLOWED = {
     "filtering": MOVIE,
     "measure": MOVIE | {"filtering"},
     "results": STORES | {"shard_files"},
-    "plots": MOVIE | {"analysis", "results", "seeds"},
+    "plots": MOVIE | {"analysis", "lazy", "results", "seeds"},
     "drift": MOVIE | {"passes"},
     "summing": MOVIE | {"passes"},
     "detection": MOVIE | {"lattice", "passes", "seeds", "windows"},
@@ -48,7 +49,7 @@ ALLOWED = {
     "analysis": MOVIE | {"columns", "measure", "results", "seeds", "vacuum", "windows"},
     "export": GROUND | {"analysis", "results", "stores"},
     "figures": MOVIE | {"analysis", "comparison", "dose", "plots", "results"},
-    "simulate": GROUND | {"analysis", "kernels", "seeds", "stores", "windows"},
+    "simulate": GROUND | {"analysis", "kernels", "lazy", "seeds", "stores", "windows"},
     "cluster": {"errors", "settings", "forkserver"},
     "forkserver": set(),
     "stages": STAGES,

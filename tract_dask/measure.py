@@ -115,30 +115,8 @@ def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.nda
     centroid[outside | bad] = np.nan
     for array in (fits.estimates, fits.stderr, fits.volume_stderr, fits.r_squared, presence, residual):
         array[outside] = np.nan
-    empty = np.full((stop - start, SIZES["place"]), np.nan, np.float32)
-    if vacuum is None:
-        noise = _damping(job.settings) * masked_median(residual, np.isfinite(residual))
-    else:
-        squares = _squares(tiles, vacuum, job.settings.noise_blur_px, gain)
-        with np.errstate(invalid="ignore"):  # pixels of bad frames
-            noise = np.asarray(squares.reshape(len(squares), -1).std(axis=1), dtype=np.float64)
-        if job.settings.window_blur_px != job.settings.noise_blur_px:
-            squares = _squares(tiles, vacuum, job.settings.window_blur_px, gain)
-        empty = _empty_strengths(squares, start, job)
-    with np.errstate(divide="ignore", invalid="ignore"):  # vacuum without noise
-        precision = _white_noise_left(job.settings.noise_blur_px) / noise[:, None]
-    weak = ~(np.abs(fits.estimates[..., AMPLITUDE]) > job.settings.threshold * noise[:, None])
-    flags = {
-        Status.BELOW_NOISE: weak & ~outside,
-        Status.NOT_CONVERGED: ~fits.converged & ~outside,
-        Status.AT_BOUND: held & ~outside,
-        Status.SHAPE_AT_BOUND: fits.at_bound & ~held & ~outside,
-        Status.OUTSIDE_FRAME: outside,
-        Status.BAD_FRAME: bad,
-    }
-    status = np.zeros(outside.shape, np.uint8)
-    for flag, found in flags.items():
-        status |= np.uint8(flag) * found
+    noise, precision, empty = _vacuum_noise(tiles, vacuum, residual, start, job, gain)
+    status = _status(fits, held, outside, bad, job.settings.threshold * noise)
     refined: Floats = drift + _common_motion(fits, status, drift, job)
     fits.estimates[..., [Y, X]] -= refined[:, None]
     intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale)
@@ -157,6 +135,48 @@ def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.nda
         "drift": refined,
         "noise": noise,
     }
+
+
+def _vacuum_noise(
+    tiles: Tiles, vacuum: NDArray[np.int64] | None, residual: Floats, start: int, job: Job, gain: float
+) -> tuple[Floats, Floats, NDArray[np.float32]]:
+    """Return the noise (frames), what turns matched filters into strengths (frames, 1), and those of empty places.
+
+    Strengths in vacuum (frames, places) are not scaled yet, and NaN where there is no vacuum: the noise is then that of
+    the fits' residuals.
+    """
+    blur = job.settings.noise_blur_px
+    empty = np.full((len(residual), SIZES["place"]), np.nan, np.float32)
+    if vacuum is None:
+        noise = _damping(job.settings) * masked_median(residual, np.isfinite(residual))
+    else:
+        squares = _squares(tiles, vacuum, blur, gain)
+        with np.errstate(invalid="ignore"):  # pixels of bad frames
+            noise = np.asarray(squares.reshape(len(squares), -1).std(axis=1), dtype=np.float64)
+        if job.settings.window_blur_px != blur:
+            squares = _squares(tiles, vacuum, job.settings.window_blur_px, gain)
+        empty = _empty_strengths(squares, start, job)
+    with np.errstate(divide="ignore", invalid="ignore"):  # vacuum without noise
+        return noise, _white_noise_left(blur) / noise[:, None], empty
+
+
+def _status(
+    fits: GaussianFits, held: NDArray[np.bool_], outside: NDArray[np.bool_], bad: NDArray[np.bool_], weakest: Floats
+) -> NDArray[np.uint8]:
+    """Return what speaks against each fit, (frames, columns); ``weakest`` (frames) is the smallest good amplitude."""
+    weak = ~(np.abs(fits.estimates[..., AMPLITUDE]) > weakest[:, None])
+    flags = {
+        Status.BELOW_NOISE: weak & ~outside,
+        Status.NOT_CONVERGED: ~fits.converged & ~outside,
+        Status.AT_BOUND: held & ~outside,
+        Status.SHAPE_AT_BOUND: fits.at_bound & ~held & ~outside,
+        Status.OUTSIDE_FRAME: outside,
+        Status.BAD_FRAME: bad,
+    }
+    status = np.zeros(outside.shape, np.uint8)
+    for flag, found in flags.items():
+        status |= np.uint8(flag) * found
+    return status
 
 
 def intensities(estimates: Floats, scale: str = "paper") -> tuple[Floats, Floats]:

@@ -129,8 +129,6 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
             str(path),
             remedy="Run the same command again to finish, or open it with unfinished=True",
         )
-    frames, *rest = stores.open_array(path / "fit").chunks
-    frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
     with stores.codec_pipeline():
         stored: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
     if lacking := [name for name in (*schema.RESULTS, *schema.COLUMNS) if name not in stored]:
@@ -141,8 +139,9 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
             f"no {', '.join(lacking)}",
             "Fit again with this version: the same tract-dask run, with --overwrite",
         )
-    dataset = stored[[*schema.RESULTS, *schema.COLUMNS]]
-    dataset = dataset.chunk(frame=frames)
+    frames, *rest = stored["fit"].encoding["chunks"]
+    frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
+    dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
     for key in ("pixel_size_pm", "frame_time_s", "dose"):
         dataset.attrs[key] = about.get(key)
     settings = from_toml(FitSettings, about["settings"], str(path))

@@ -1,0 +1,36 @@
+"""Names of a package that are imported when they are first used (PEP 562): importing the package costs nothing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+
+def lazy_names(package: str, homes: dict[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return the ``__getattr__`` and ``__dir__`` of a package.
+
+    Parameters
+    ----------
+    package
+        Its ``__name__``.
+    homes
+        The module inside the package that holds each name.
+
+    Examples
+    --------
+    >>> find, names = lazy_names("tract_dask", {"open_movie": "movie"})
+    >>> find("open_movie").__module__
+    'tract_dask.movie'
+    """
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(f".{homes[name]}", package), name)
+
+    def names() -> list[str]:
+        return sorted([*vars(sys.modules[package]), *homes])
+
+    return find, names
