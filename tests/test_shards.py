@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, as_completed
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -145,3 +145,18 @@ def test_a_cluster_that_loses_all_its_workers_is_given_up(cluster, tmp_path, mon
     with Client(cluster) as client, pytest.raises(ClusterError, match="without a worker"):
         run_shards(wait_long, split(1000, 1), journal=journal, name="wait", client=client)
     assert 0 < len(journal.done()) < 1000
+
+
+def test_a_result_that_its_worker_took_along_is_not_waited_for(cluster, tmp_path, monkeypatch):
+    class Leaving(as_completed):
+        def __next__(self):
+            future = super().__next__()
+            cluster.scale(0)
+            while future.client.nthreads():
+                time.sleep(0.01)
+            return future
+
+    monkeypatch.setattr(shards, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(shards, "as_completed", Leaving)
+    with Client(cluster) as client, pytest.raises(ClusterError, match="without a worker"):
+        run_shards(wait_long, split(10, 1), journal=Journal(tmp_path / "journal", "key"), name="wait", client=client)

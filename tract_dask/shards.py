@@ -286,9 +286,10 @@ def _run_on(client: Client, work: Work, todo: Numbers, shards: Sequence[Shard], 
     Thread(target=_watch, args=(client, running, ended), daemon=True).start()
     try:
         for future in completed:
-            batch = running.pop(future)
+            batch = running[future]
             with _cluster_errors(name, shards[batch[0]].start, shards[batch[-1]].stop):
-                payloads, seconds = future.result()
+                payloads, seconds = future.result()  # waits anew where the worker that held it has gone
+            del running[future]
             queue.give_back(batch[len(payloads) :])
             size = _next_size(size, len(payloads) / max(seconds, 1e-6), queue.left // (2 * window))
             if queue.left:
@@ -320,8 +321,7 @@ def _watch(client: Client, running: Iterable[Any], ended: Event) -> None:
         if client.nthreads():
             alone_since = monotonic()
         elif monotonic() - alone_since > _PATIENCE_S:
-            client.cancel(list(running), force=True)
-            return
+            client.cancel(list(running), force=True)  # once more each second: the loop may have submitted another
 
 
 @contextmanager
