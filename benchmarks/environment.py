@@ -7,6 +7,7 @@ import subprocess
 import sys
 import venv
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -27,14 +28,17 @@ def peers_python(peers: Sequence[str]) -> Path:
     """Return the Python of the peers' environment, with these peers installed in it."""
     folder = VENV / ("Scripts" if sys.platform == "win32" else "bin")
     wanted = [package for peer in peers for package in PACKAGES[peer]]
+    python = folder / "python"
     if not folder.exists():
         venv.create(VENV, with_pip=True)
-    missing = sorted(set(wanted) - set(versions(folder / "python")))
+    missing = sorted(set(wanted) - set(versions(python)))
     if missing:
         print(f"Installing {', '.join(missing)} into {VENV} ...", file=sys.stderr)
-        pip = [str(folder / "python"), "-m", "pip", "install", "--quiet", "--constraint", str(REQUIREMENTS)]
-        subprocess.run([*pip, *missing], check=True, stdout=sys.stderr)
-    return folder / "python"
+        packages = ["--quiet", "--constraint", str(REQUIREMENTS), *missing]
+        uv = [sys.executable, "-m", "uv", "pip", "install", "--python", str(python), *packages]
+        if find_spec("uv") is None or subprocess.run(uv, check=False, stdout=sys.stderr).returncode:
+            subprocess.run([python, "-m", "pip", "install", *packages], check=True, stdout=sys.stderr)
+    return python
 
 
 def versions(python: Path) -> dict[str, str]:

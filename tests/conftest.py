@@ -8,8 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import settings
 
 from tract_dask import schema
+
+settings.register_profile("checks", deadline=None)  # a busy machine is no fault of the code
+settings.load_profile("checks")
 
 
 @dataclass
@@ -108,6 +112,14 @@ class Scene:
                 "exposure": (("y", "x"), np.full(self.shape, self.n_frames, np.uint32)),
             }
         )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests begin first, so that none of them is left for the end, and may take longer than the others."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(600))
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture

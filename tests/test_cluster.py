@@ -1,17 +1,23 @@
 """Clients from settings, and whether their workers are fit for the work."""
 
 import importlib.metadata
+import json
 import os
+import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from tract_dask import cluster, forkserver
 from tract_dask.errors import ClusterError, SettingsError
-from tract_dask.settings import ClusterSettings
+from tract_dask.options import collect
+from tract_dask.service.running.keeper import Keeper
+from tract_dask.settings import ClusterSettings, from_toml, to_toml
 
 VERSION = importlib.metadata.version("tract_dask")
 
@@ -87,6 +93,7 @@ def test_scheduler_file_of_a_running_scheduler(tmp_path):
         try:
             while not file.exists() or not file.read_text():
                 assert scheduler.poll() is None
+                time.sleep(0.02)
             with cluster.connect(ClusterSettings(scheduler_file=str(file))) as client:
                 with pytest.raises(ClusterError, match="no workers") as caught:
                     cluster.check_workers(client, timeout_s=0.2)
@@ -170,3 +177,157 @@ def test_workers_that_cannot_start_are_told_with_what_a_script_needs(monkeypatch
     told = r"(?s)Nanny failed to start.*if __name__ == \"__main__\":"
     with pytest.raises(ClusterError, match=told), cluster.connect(ClusterSettings(workers=1)):
         pass
+
+
+RACE = """
+import gc, sys, threading, time
+from pathlib import Path
+import numba, numpy as np
+from tract_dask.stores import load_array
+
+path = Path(sys.argv[1])
+np.save(path, np.zeros(3, dtype=[(f"field{k}", "f4") for k in range(300)]))
+sys.setswitchinterval(1e-6)
+gc.set_threshold(20, 2, 2)
+gc.callbacks.append(lambda phase, about: list(range(10)))  # as a worker has one: the moment at which threads change
+end = time.monotonic() + 1.5
+
+def repeat(work):
+    while time.monotonic() < end:
+        work()
+
+def compile_one():
+    numba.njit(lambda x: x + 1)(1)
+
+threads = [threading.Thread(target=repeat, args=(work,)) for work in 3 * [lambda: load_array(path)] + [compile_one]]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+"""
+
+
+def test_threads_of_a_worker_read_arrays_while_others_compile(tmp_path):
+    """With plain numpy.load this fails within 0.2 s: "AST constructor recursion depth mismatch"."""
+    race = [sys.executable, "-c", RACE, str(tmp_path / "array.npy")]
+    done = subprocess.run(race, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+
+
+def examples() -> list[str]:
+    text = (Path(__file__).parents[1] / "docs" / "deploy.md").read_text(encoding="utf-8")
+    return re.findall(r"^```toml\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def test_examples_of_the_documentation_are_settings():
+    kinds = [from_toml(ClusterSettings, text).resolved_kind for text in examples()]
+    assert kinds == ["ssh", "slurm"]
+
+
+def test_cluster_file_takes_the_place_of_the_cluster_in_the_configuration(tmp_path):
+    (tmp_path / "run.toml").write_text('[cluster]\nworkers = 3\nscheduler = "tcp://a:1"\n[fit]\nthreshold = 3.0')
+    (tmp_path / "cluster.toml").write_text(examples()[1])
+    given = {"cluster__workers": 7, "cluster__memory_limit": None}
+    settings = collect(given, tmp_path / "run.toml", tmp_path / "cluster.toml")
+    assert settings.fit.threshold == 3.0
+    assert (settings.cluster.kind, settings.cluster.workers, settings.cluster.scheduler) == ("slurm", 7, None)
+    assert settings.cluster.slurm.directives == ("--constraint=avx512", "--exclude=node7")
+    assert from_toml(ClusterSettings, to_toml(settings.cluster)) == settings.cluster
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('kind = "pbs"', "no such choice"),
+        ('kind = "address"', "scheduler or scheduler_file"),
+        ('kind = "slurm"\nworkers = 4', "workers and memory_limit"),
+        ('kind = "ssh"', r"hosts in the table \[ssh\]"),
+        ('kind = "local"\nscheduler = "tcp://a:1"', "contradict"),
+        ('kind = "slurm"\nworkers = 2\nmin_workers = 3\nmemory_limit = "1GB"', "at most workers, 2"),
+        ('[slurm]\nwalltime = "an hour"', "another form"),
+        ('[slurm]\ndirectives = ["exclusive"]', "begin with a dash"),
+        ("[slurm]\ndirectives = [7]", "begin with a dash"),
+        ('[slurm]\nqueue = "a b"', "letters, digits"),
+        ('[slurm]\nprologue = ["a\\nb"]', "single lines"),
+        ('[ssh]\nhosts = ["-oProxyCommand=x"]', "names such as node1"),
+        ('[ssh]\nhosts = "node1"', "wrong type"),
+        ("slurm = 3", "group of settings"),
+        ("nodes = 3", "no setting 'nodes'"),
+        ("threads = 0", "out of range"),
+    ],
+)
+def test_cluster_settings_that_mean_nothing_are_named(text, said):
+    with pytest.raises(SettingsError, match=said):
+        from_toml(ClusterSettings, text)
+
+
+def test_work_waits_for_a_queue_longer_than_for_a_machine():
+    assert ClusterSettings().resolved_patience_s == 60
+    assert from_toml(ClusterSettings, 'kind="slurm"\nworkers=1\nmemory_limit="1GB"').resolved_patience_s == 86400
+    assert ClusterSettings(kind="local", patience_s=5).resolved_patience_s == 5
+
+
+def wait_for(true: object, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def children(pid: int) -> list[psutil.Process]:
+    return psutil.Process(pid).children(recursive=True)
+
+
+def test_keeper_starts_a_killed_cluster_again_and_leaves_nothing_behind(tmp_path):
+    keeper = Keeper(ClusterSettings(workers=1, memory_limit="700MB"), tmp_path)
+    with pytest.raises(ClusterError, match="not up"):
+        keeper.ready(0.0)
+    assert (keeper.workers(), keeper.dashboard()) == ([], None)
+    keeper.start()
+    try:
+        found = keeper.ready(60.0)
+        assert found.resolved_kind == "address"
+        first = json.loads(Path(found.scheduler_file).read_text())["address"]
+        wait_for(keeper.workers)
+        (worker,) = keeper.workers()
+        assert (worker["memory_limit"], worker["executing"], worker["stage"]) == (700_000_000, 0, "")
+        assert keeper.dashboard().startswith("http://127.0.0.1:")
+        holder = next(
+            child for child in psutil.Process().children() if "tract_dask.service.running.keeper" in child.cmdline()
+        )
+        before = [holder, *children(holder.pid)]
+        holder.kill()
+        file = Path(found.scheduler_file)
+        wait_for(lambda: file.exists() and json.loads(file.read_text())["address"] != first)
+        assert keeper.ready(1.0) == found
+        with cluster.connect(found) as client:
+            assert client.submit(sum, [1, 2]).result() == 3
+        holder = next(
+            child for child in psutil.Process().children() if "tract_dask.service.running.keeper" in child.cmdline()
+        )
+        after = [holder, *children(holder.pid)]
+    finally:
+        keeper.stop()
+    wait_for(lambda: not any(process.is_running() for process in before + after))
+
+
+SERVICE = """
+import sys, time
+from pathlib import Path
+from tract_dask.service.running.keeper import Keeper
+from tract_dask.settings import ClusterSettings
+keeper = Keeper(ClusterSettings(workers=1, memory_limit="700MB"), Path(sys.argv[1]))
+keeper.start()
+keeper.ready(60.0)
+print("ready", flush=True)
+time.sleep(600)
+"""
+
+
+def test_cluster_ends_with_a_killed_service(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", SERVICE, str(tmp_path)], stdout=subprocess.PIPE, text=True) as service:
+        assert service.stdout.readline() == "ready\n"
+        orphans = children(service.pid)
+        assert len(orphans) >= 2
+        service.kill()
+    wait_for(lambda: not any(orphan.is_running() for orphan in orphans))

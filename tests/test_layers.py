@@ -12,7 +12,7 @@ GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"provenance", "stores", "shards"}
 MOVIE = STORES | {"io", "movie", "kernels"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
-RUN = STAGES | {"cluster", "stages", "pipeline"}
+RUN = STAGES | {"cluster", "stages", "pipeline", "tls"}
 
 ALLOWED = {
     "errors": set(),
@@ -50,18 +50,31 @@ ALLOWED = {
     "export": GROUND | {"analysis", "results", "stores"},
     "figures": MOVIE | {"analysis", "comparison", "dose", "plots", "results"},
     "simulate": GROUND | {"analysis", "kernels", "lazy", "seeds", "stores", "windows"},
-    "cluster": {"errors", "settings", "forkserver"},
+    "tls": {"certificates", "errors"},
+    "slurm": {"errors", "forkserver", "settings", "tls"},
+    "supervision": set(),
+    "ssh": {"errors", "forkserver", "settings", "supervision", "tls"},
+    "cluster": {"errors", "settings", "forkserver", "shards", "slurm", "ssh", "tls"},
     "forkserver": set(),
     "stages": STAGES,
     "report": MOVIE | {"analysis", "plots", "results", "windows"},
     "pipeline": STAGES | {"cluster", "report", "stages"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
+    "editor": RUN | {"service"},
     "options": {"settings"},
-    "terminal": {"progress"},
+    "console": {"options"},
+    "certificates": {"errors"},
+    "service": RUN
+    | {"analysis", "certificates", "describe", "export", "forkserver", "meter", "report", "supervision", "terminal"},
+    "client": {"errors", "results", "service", "settings"},
+    "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
+    "hosting": {"certificates", "console", "options", "service", "settings"},
+    "meter": {"progress"},
+    "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"options", "report", "simulate", "terminal"},
+    | {"console", "editor", "hosting", "options", "remote", "report", "simulate", "terminal"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

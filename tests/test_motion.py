@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -18,7 +20,7 @@ from tract_dask.analysis.jumps import (
     noise_factor,
     threshold_jumps,
 )
-from tract_dask.analysis.motion import displacement, lattice_displacement, positions, spread
+from tract_dask.analysis.motion import displacement, lattice_displacement, positions, spread, standard_deviation
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.changepoints import critical_penalty, plateaus
 
@@ -307,3 +309,16 @@ def test_a_lattice_fitted_to_some_columns_says_how_the_others_relax():
 def test_what_is_no_lattice_is_refused(places):
     with pytest.raises(SettingsError, match="no lattice"):
         lattice_displacement(tracks_of(places[None] + np.zeros((2, 1, 1))))
+
+
+@pytest.mark.parametrize("chunks", [None, {"frame": 7}])
+def test_standard_deviation_is_numpys_and_columns_without_values_bring_no_warning(chunks):
+    values = 16000 + np.random.default_rng(2).normal(0, 5, (40, 5, 2))
+    values[:, 1], values[1:, 2], values[:9, 3], values[:, 4] = np.nan, np.nan, np.nan, 1.25
+    array = xr.DataArray(values, dims=("frame", "column_id", "axis"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = standard_deviation(array if chunks is None else array.chunk(chunks)).compute()
+    assert found.isel(column_id=[1, 2]).isnull().all()
+    expected = np.stack([values[:, 0].std(axis=0, ddof=1), values[9:, 3].std(axis=0, ddof=1), np.zeros(2)])
+    np.testing.assert_allclose(found.isel(column_id=[0, 3, 4]), expected, rtol=1e-8, atol=1e-12)

@@ -403,7 +403,7 @@ def test_a_killed_conversion_ends_as_an_undisturbed_one(tmp_path, seconds):
     source, path = save(tmp_path / "movie.npy", frames), tmp_path / "movie.zarr"
     process = subprocess.Popen([sys.executable, "-c", CONVERT, source, path], start_new_session=True)
     while process.poll() is None and not stores.attributes(path):
-        time.sleep(0.001)
+        time.sleep(0.005)
     time.sleep(seconds)
     os.killpg(process.pid, signal.SIGKILL)
     assert process.wait() in (0, -signal.SIGKILL)
@@ -458,14 +458,13 @@ def test_a_disk_that_is_too_small_is_told_before_work(tmp_path, source, monkeypa
     assert [file.name for file in tmp_path.iterdir()] == ["movie.npy"]
 
 
-@pytest.mark.parametrize("error", [RuntimeError("No space left on device (os error 28)"), OSError(28, os.strerror(28))])
-def test_a_disk_that_becomes_full_keeps_what_is_done(tmp_path, source, counts, monkeypatch, error):
+def test_a_disk_that_becomes_full_keeps_what_is_done(tmp_path, source, counts, monkeypatch):
     path, add, done = tmp_path / "movie.zarr", ShardWriter.add, []
 
     def full(writer, frame):
         done.append(frame.shape)
         if len(done) > 15:  # in the third shard: three frames and their binned level each
-            raise error
+            raise OSError(28, os.strerror(28))
         add(writer, frame)
 
     with monkeypatch.context() as patch:

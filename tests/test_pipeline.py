@@ -14,10 +14,9 @@ from distributed import Client, LocalCluster
 
 from tract_dask import cluster, pipeline, settings, stores
 from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError
-from tract_dask.progress import RunDone, RunStarted, StageDone, StageStarted, Warned
+from tract_dask.progress import REPORT, STAGES, RunDone, RunStarted, StageDone, StageStarted, Warned
 from tract_dask.results import open_results
 from tract_dask.settings import ConvertSettings, RunSettings
-from tract_dask.stages import STAGES
 
 SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1))
 
@@ -90,7 +89,7 @@ def test_run_writes_everything_and_finds_the_scene(job, scene):
     assert outcome.columns == len(scene.place)
     assert outcome.frames == scene.n_frames
     assert outcome.fits == scene.n_frames * len(scene.place)
-    assert set(outcome.seconds) == set(STAGES)
+    assert set(outcome.seconds) == {*STAGES, REPORT}
     assert all(Path(path).exists() for path in outcome.outputs.paths().values())
     results = open_results(outcome.outputs.results).load()
     place = np.stack([results["x_ref"], results["y_ref"]], axis=1)
@@ -252,7 +251,7 @@ def test_run_of_another_movie_is_not_replaced(done, npy, scene):
 
 def test_two_runs_in_one_folder(job):
     job.output.mkdir()
-    with pipeline._sole_run(pipeline.Outputs(job.output)), pytest.raises(DestinationError, match="another run works"):
+    with pipeline.sole_run(pipeline.Outputs(job.output)), pytest.raises(DestinationError, match="another run works"):
         job()
 
 

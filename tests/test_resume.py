@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,7 @@ def whole(movie, client) -> pipeline.RunOutcome:
     return pipeline.run(movie, movie.with_name("whole"), SETTINGS, client=client)
 
 
+@pytest.mark.slow
 def test_killed_runs_end_as_an_uninterrupted_one(movie, tmp_path):
     options = [
         "--moments",
@@ -77,6 +79,7 @@ def test_killed_worker_is_replaced_and_nothing_is_lost(movie, client, whole, tmp
     xr.testing.assert_equal(open_results(whole.outputs.results).load(), open_results(hurt.outputs.results).load())
 
 
+@pytest.mark.slow
 def test_scheduler_and_workers_started_by_hand_give_the_same_results(movie, whole, tmp_path):
     file = tmp_path / "scheduler.json"
     options = ["--scheduler-file", str(file), "--no-dashboard"]
@@ -91,6 +94,7 @@ def test_scheduler_and_workers_started_by_hand_give_the_same_results(movie, whol
             )
             while not file.exists() or not file.read_text():
                 assert processes[0].poll() is None
+                time.sleep(0.02)
         far = ClusterSettings(scheduler_file=str(file))
         spread = pipeline.run(movie, tmp_path / "far", RunSettings(convert=SETTINGS.convert, cluster=far))
     finally:

@@ -141,7 +141,13 @@ def test_whoever_takes_the_payloads_may_stop_the_work(cluster, tmp_path):
 def test_a_cluster_that_loses_all_its_workers_is_given_up(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(shards, "_PATIENCE_S", 1.0)
     journal = Journal(tmp_path / "journal", "key")
-    threading.Timer(0.5, cluster.scale, args=(0,)).start()
+
+    def leave():
+        while not journal.done():
+            time.sleep(0.02)
+        cluster.scale(0)
+
+    threading.Thread(target=leave, daemon=True).start()
     with Client(cluster) as client, pytest.raises(ClusterError, match="without a worker"):
         run_shards(wait_long, split(1000, 1), journal=journal, name="wait", client=client)
     assert 0 < len(journal.done()) < 1000

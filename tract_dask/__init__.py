@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 from .lazy import lazy_names
 
 if TYPE_CHECKING:
+    from .client import ServiceClient
     from .columns import find_columns, lattice_columns
     from .comparison import compare_filters
     from .conversion import convert
     from .detection import detect_columns, link_detections
     from .dose import fit_doses, rebin_frames
     from .drift import estimate_drift
+    from .editor import edit_columns
     from .filtering import filter_frames
     from .fit import fit_columns
     from .io import open_source
@@ -32,6 +34,7 @@ _ROOMS = {
     "convert": "conversion",
     "open_movie": "movie",
     "estimate_drift": "drift",
+    "edit_columns": "editor",
     "sum_image": "summing",
     "find_columns": "columns",
     "lattice_columns": "columns",
@@ -46,13 +49,16 @@ _ROOMS = {
     "open_results": "results",
     "accepted": "results",
     "simulate_movie": "simulate",
+    "ServiceClient": "client",
 }
 
 __all__ = [
+    "ServiceClient",
     "accepted",
     "compare_filters",
     "convert",
     "detect_columns",
+    "edit_columns",
     "estimate_drift",
     "filter_frames",
     "find_columns",

@@ -21,8 +21,12 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
+from .console import DEBUG, PATH, Subgroup, common_options, show
 from .errors import TractError
+from .hosting import certs, serve, token
 from .options import Command, class_options, numbers, setting_options
+from .progress import STAGES
+from .remote import cancel, jobs, submit, watch
 from .settings import RunSettings
 from .simulate.settings import PRESETS, Microscope, SpecimenSettings
 
@@ -34,10 +38,6 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 FAILED, BAD_FRAMES, INTERRUPTED = 1, 3, 130
 """Exit codes beside 0, and 2 for usage or bad input."""
-
-PATH = click.Path(path_type=Path)
-
-_DEBUG = "tract_dask.debug"
 
 
 class Group(click.Group):
@@ -67,29 +67,10 @@ class Group(click.Group):
             self._explain(ctx, text, FAILED)
 
     def _explain(self, ctx: click.Context, text: str, code: int) -> None:
-        if ctx.meta.get(_DEBUG):
+        if ctx.meta.get(DEBUG):
             traceback.print_exc()
         click.echo(text, err=True)
         ctx.exit(code)
-
-
-class Subgroup(click.Group):
-    """Commands of one subject."""
-
-    command_class = Command
-
-
-def common_options(function: F) -> F:
-    """Give a command ``--json`` and ``--debug``."""
-    debug = click.option(
-        "--debug",
-        is_flag=True,
-        expose_value=False,
-        callback=lambda ctx, param, value: ctx.meta.update({_DEBUG: value}),
-        help="Show where in the program an error came up.",
-    )
-    as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON; progress goes to stderr.")
-    return as_json(debug(function))
 
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Begin anew, whatever is there.")
@@ -114,10 +95,11 @@ def main() -> None:
 @click.argument("output", type=PATH)
 @click.option("--plan", "plan_only", is_flag=True, help="Print what would be done, and stop.")
 @click.option("--report/--no-report", default=True, help="Write report.html at the end [on].")
+@click.option("--until", type=click.Choice(STAGES[:-1]), help="Stop after this stage, such as to edit columns.csv.")
 @overwrite_option
 @common_options
 @setting_options("source", "metadata", "convert", "drift", "columns", "fit", "cluster")
-def run(source: str, output: Path, settings: RunSettings, *, as_json: bool, **options: bool) -> None:
+def run(source: str, output: Path, settings: RunSettings, *, as_json: bool, **options: Any) -> None:
     """Turn the movie SOURCE into tracks in the folder OUTPUT.
 
     Run it again to go on where it was stopped; changed settings redo only what they affect.
@@ -139,7 +121,7 @@ def inspect(path: str, settings: RunSettings, *, as_json: bool) -> None:
     """
     from .describe import describe
 
-    _show(describe(path, settings), as_json=as_json)
+    show(describe(path, settings), as_json=as_json)
 
 
 @main.command()
@@ -172,12 +154,20 @@ def drift(movie: Path, output: Path, settings: RunSettings, *, as_json: bool) ->
 @main.command()
 @click.argument("movie", type=PATH)
 @click.argument("output", type=PATH)
+@click.option("--edit", is_flag=True, help="Then edit them in the browser; what is saved there is written to OUTPUT.")
 @drift_option
 @overwrite_option
 @common_options
 @setting_options("columns", "fit.window_px", "fit.blur_sigma_px", "cluster")
 def columns(
-    movie: Path, output: Path, settings: RunSettings, *, drift_from: Path | None, overwrite: bool, as_json: bool
+    movie: Path,
+    output: Path,
+    settings: RunSettings,
+    *,
+    drift_from: Path | None,
+    edit: bool,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Find the columns of the store MOVIE, into OUTPUT (.csv).
 
@@ -186,6 +176,8 @@ def columns(
     pipeline = _pipeline(settings)
     with _progress() as on_event:
         pipeline.run_columns(movie, output, settings, drift_from, on_event=on_event, overwrite=overwrite)
+        if edit and _edit(output, settings):
+            pipeline.run_columns(movie, output, settings, drift_from, on_event=on_event)
     _show_store(output.with_suffix(".zarr"), as_json=as_json)
 
 
@@ -260,7 +252,7 @@ def demo(folder: Path, settings: RunSettings, *, frames: int, as_json: bool) -> 
 
     with _progress() as on_event:
         found = run_demo(folder, frames, settings, on_event=on_event)
-    _show(found, as_json=as_json)
+    show(found, as_json=as_json)
 
 
 @main.command()
@@ -275,7 +267,7 @@ def report(folder: Path, file: Path | None, *, as_json: bool) -> None:
     from .report import write_report
 
     written = write_report(folder, file)
-    _show({"wrote": str(written), "bytes": written.stat().st_size}, as_json=as_json)
+    show({"wrote": str(written), "bytes": written.stat().st_size}, as_json=as_json)
 
 
 @main.command()
@@ -306,7 +298,7 @@ def export(results: Path, file: Path, *, overwrite: bool, accepted_only: bool, a
         exporting.to_xyz(tracks, counts, file, spacing_pm=spacing_pm, overwrite=overwrite, **model)
     else:
         exporting.export(results, file, accepted_only=accepted_only, overwrite=overwrite)
-    _show({"wrote": str(file), "bytes": file.stat().st_size}, as_json=as_json)
+    show({"wrote": str(file), "bytes": file.stat().st_size}, as_json=as_json)
 
 
 @main.command()
@@ -332,7 +324,7 @@ def figures(
     names = None if only is None else [name.strip() for name in only.split(",")]
     drawn = draw_figures(out, folder, names, table=table, suffix=f".{suffix}")
     found: dict[str, Any] = {"wrote": [str(path) for path in drawn.files.values()]}
-    _show(found | ({"skipped": drawn.skipped} if as_json else {}), as_json=as_json)
+    show(found | ({"skipped": drawn.skipped} if as_json else {}), as_json=as_json)
     for name, reason in drawn.skipped.items():
         click.echo(f"Not drawn: {name}. {reason}", err=True)
 
@@ -371,7 +363,7 @@ def simulate_movie(
     from .simulate.files import write_simulated_movie
 
     written = write_simulated_movie(output, model, specimen, microscope, **options)
-    _show({"wrote": [str(path) for path in written]}, as_json=as_json)
+    show({"wrote": [str(path) for path in written]}, as_json=as_json)
 
 
 @simulate.command(name="image")
@@ -390,7 +382,7 @@ def simulate_image(
     from .simulate.files import write_simulated_image
 
     written = write_simulated_image(output, specimen, microscope, pixel_size_pm)
-    _show({"wrote": [str(path) for path in written]}, as_json=as_json)
+    show({"wrote": [str(path) for path in written]}, as_json=as_json)
 
 
 @simulate.command(name="table")
@@ -423,7 +415,22 @@ def simulate_table(
     options["contrast"] = settings.columns.contrast
     table, written = write_simulated_table(output, specimen, microscope, settings.fit, **options)
     found = {str(n): round(float(value), 4) for n, value in table["intensity"].to_series().items()}
-    _show(found | {"wrote": [str(path) for path in written]}, as_json=as_json)
+    show(found | {"wrote": [str(path) for path in written]}, as_json=as_json)
+
+
+for service_command in (serve, token, certs, submit, jobs, watch, cancel):
+    main.add_command(service_command)
+
+
+def _edit(table: Path, settings: RunSettings) -> bool:
+    """Let the user edit a table of columns in the browser; tell whether it was saved."""
+    from .editor import edit_table
+
+    return edit_table(
+        table,
+        settings,
+        lambda url: click.echo(f"Editing {table.name} at {url}\nCtrl-C ends it; what was saved is kept.", err=True),
+    )
 
 
 def _pipeline(settings: RunSettings) -> ModuleType:
@@ -452,7 +459,7 @@ def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(outcome.to_record()))
     elif outcome.state == "planned":
-        _show(_plan_rows(outcome.plan), as_json=False)
+        show(_plan_rows(outcome.plan), as_json=False)
     else:
         share = f" ({outcome.accepted / outcome.fits:.1%})" if outcome.fits else ""
         rows = {
@@ -463,7 +470,7 @@ def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:
         }
         rows |= {"frames not fitted": outcome.bad_frames} if outcome.bad_frames else {}
         written = [path for path in outcome.outputs.paths().values() if Path(path).exists()]
-        _show(rows | {"wrote": written}, as_json=False)
+        show(rows | {"wrote": written}, as_json=False)
     if outcome.state == "planned":
         outcome.plan.check()
     _exit_for(outcome.bad_frames)
@@ -472,7 +479,7 @@ def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:
 def _show_store(path: Path, *, as_json: bool) -> None:
     from .describe import describe
 
-    _show(describe(path), as_json=as_json)
+    show(describe(path), as_json=as_json)
 
 
 def _plan_rows(plan: Plan) -> dict[str, str]:
@@ -486,17 +493,6 @@ def _plan_rows(plan: Plan) -> dict[str, str]:
         "written": f"{size(plan.bytes_written)} before compression",
         "peak memory": f"{size(plan.peak_memory)} a task, of {limit}",
     }
-
-
-def _show(found: dict[str, Any], *, as_json: bool) -> None:
-    """Print a mapping as JSON, or as lines of names and values."""
-    if as_json:
-        click.echo(json.dumps(found))
-        return
-    width = max(map(len, found), default=0)
-    for name, value in found.items():
-        for k, line in enumerate(value if isinstance(value, list) else [value]):
-            click.echo(f"{name if k == 0 else '':<{width}}  {'-' if line is None else line}")
 
 
 def _exit_for(bad_frames: int) -> None:

@@ -1,10 +1,11 @@
-"""A Dask client from nothing, an address or a scheduler file, and whether its workers are fit for the work."""
+"""A Dask client from nothing, an address, SLURM or ssh, and whether its workers are fit for the work."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
 import logging
+import shlex
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,6 +21,8 @@ from distributed.system import MEMORY_LIMIT
 from . import forkserver
 from .errors import ClusterError, SettingsError
 from .settings import ClusterSettings
+from .shards import PATIENCE, patience_s
+from .tls import checked_address, security, worker_flags
 
 PACKAGE = "tract_dask"
 
@@ -49,8 +52,36 @@ def connect(settings: ClusterSettings | None = None, *, timeout_s: float = 10.0)
             f"{settings.scheduler} and {settings.scheduler_file}",
             "Leave one out",
         )
-    with _local(settings) if _is_local(settings) else _remote(settings, timeout_s) as client:
-        yield client
+    if settings.resolved_kind == "address":
+        with _remote(settings, timeout_s) as client:
+            yield client
+    else:
+        with hold(settings) as cluster, Client(cluster) as client:
+            yield client
+
+
+@contextmanager
+def hold(settings: ClusterSettings) -> Iterator[Any]:
+    """Yield a running cluster (:class:`distributed.deploy.Cluster`) of any kind but address; it ends with the block.
+
+    Raises
+    ------
+    ClusterError
+        Where it does not come up.
+    """
+    if settings.resolved_kind == "slurm":
+        from .slurm import hold_slurm  # an extra
+
+        with hold_slurm(settings, memory_limit(settings)) as cluster:
+            yield cluster
+    elif settings.resolved_kind == "ssh":
+        from .ssh import hold_ssh
+
+        with hold_ssh(settings, memory_limit(settings)) as cluster:
+            yield cluster
+    else:
+        with _hold_local(settings) as cluster:
+            yield cluster
 
 
 class LazyClient:
@@ -72,8 +103,8 @@ class LazyClient:
         client: Client | None = None,
         on_connect: Callable[[Client], None] = lambda client: None,
     ) -> None:
-        self._settings, self._given, self._on_connect = settings, client, on_connect
-        if client is None and _is_local(settings or ClusterSettings()):
+        self._settings, self._given, self._on_connect = settings or ClusterSettings(), client, on_connect
+        if client is None and self._settings.resolved_kind == "local":
             forkserver.start()  # it imports while this process prepares the work
         self._stack = ExitStack()
         self._client: Client | None = None
@@ -92,14 +123,17 @@ class LazyClient:
             As :func:`connect` and :func:`check_workers`.
         """
         if self._client is None:
-            client = self._given or self._stack.enter_context(connect(self._settings))
-            check_workers(client)
+            client = self._given
+            if client is None:
+                self._stack.enter_context(dask.config.set({PATIENCE: self._settings.resolved_patience_s}))
+                client = self._stack.enter_context(connect(self._settings))
+            check_workers(client, timeout_s=patience_s())
             self._on_connect(client)
             self._client = client
         return self._client
 
 
-def check_workers(client: Client, *, timeout_s: float = 30.0) -> None:
+def check_workers(client: Client, *, timeout_s: float = 60.0) -> None:
     """Check that the cluster has workers, and that each has this version of the package.
 
     Raises
@@ -116,7 +150,7 @@ def check_workers(client: Client, *, timeout_s: float = 30.0) -> None:
             address,
             "one worker or more",
             f"none within {timeout_s:g} s",
-            f"Start some with: dask worker {address}",
+            f"Start some with: {shlex.join(['dask', 'worker', address, *worker_flags(client.security)])}",
         ) from error
     expected = importlib.metadata.version(PACKAGE)
     found: dict[str, Any] = client.run(importlib.metadata.version, PACKAGE, on_error="return")
@@ -130,10 +164,6 @@ def check_workers(client: Client, *, timeout_s: float = 30.0) -> None:
                 "none" if missing else str(version),
                 f"Install {PACKAGE} {expected} in the worker's environment and start it again",
             )
-
-
-def _is_local(settings: ClusterSettings) -> bool:
-    return not (settings.scheduler or settings.scheduler_file)
 
 
 def memory_budget(client: Client) -> int | None:
@@ -164,8 +194,19 @@ def local_memory_limit(settings: ClusterSettings) -> int:
     >>> local_memory_limit(ClusterSettings(memory_limit="2GB"))
     2000000000
     """
+    return memory_limit(settings) or int(MEMORY_LIMIT) // local_workers(settings)
+
+
+def memory_limit(settings: ClusterSettings) -> int | None:
+    """Return the memory limit of a worker in bytes as set; None where it is not.
+
+    Raises
+    ------
+    SettingsError
+        Where the setting is no size.
+    """
     if settings.memory_limit is None:
-        return int(MEMORY_LIMIT) // local_workers(settings)
+        return None
     try:
         return int(parse_bytes(settings.memory_limit))
     except ValueError as error:
@@ -179,8 +220,8 @@ def local_memory_limit(settings: ClusterSettings) -> int:
 
 
 @contextmanager
-def _local(settings: ClusterSettings) -> Iterator[Client]:
-    """Start workers of one thread each, whose libraries use one thread each."""
+def _hold_local(settings: ClusterSettings) -> Iterator[LocalCluster]:
+    """Start workers of one thread each, if not set otherwise, whose libraries use one thread each."""
     changes: dict[str, Any] = {_NANNY_ENVIRONMENT: dict(dask.config.get(_NANNY_ENVIRONMENT)) | forkserver.ENVIRONMENT}
     if forkserver.AVAILABLE:
         changes[_PROCESS_METHOD] = "forkserver"
@@ -190,9 +231,12 @@ def _local(settings: ClusterSettings) -> Iterator[Client]:
         try:
             cluster = LocalCluster(
                 n_workers=local_workers(settings),
-                threads_per_worker=1,
+                threads_per_worker=settings.threads,
                 memory_limit=local_memory_limit(settings),
                 processes=True,
+                protocol="tls://" if settings.tls else "tcp://",
+                security=security(settings.tls),
+                local_directory=settings.local_directory,
                 dashboard_address="127.0.0.1:8787",
                 silence_logs=logging.CRITICAL,
             )
@@ -205,16 +249,16 @@ def _local(settings: ClusterSettings) -> Iterator[Client]:
                 'In a script, put what is run under if __name__ == "__main__": since workers import the script; '
                 "otherwise look at what the workers wrote above, and whether the memory limit is too small",
             ) from error
-        with cluster, Client(cluster) as client:
-            yield client
+        with cluster:
+            yield cluster
 
 
 @contextmanager
 def _remote(settings: ClusterSettings, timeout_s: float) -> Iterator[Client]:
     where = settings.scheduler or str(settings.scheduler_file)
-    target = {"address": settings.scheduler} if settings.scheduler else {"scheduler_file": _scheduler_file(where)}
+    address = checked_address(scheduler_address(settings), settings.tls)
     try:
-        client = Client(**target, timeout=timeout_s)
+        client = Client(address, timeout=timeout_s, security=security(settings.tls))
     except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError; the others mean a malformed address
         raise ClusterError(
             "the scheduler cannot be reached",
@@ -227,9 +271,19 @@ def _remote(settings: ClusterSettings, timeout_s: float) -> Iterator[Client]:
         yield client
 
 
-def _scheduler_file(name: str) -> str:
+def scheduler_address(settings: ClusterSettings) -> str:
+    """Return the address of the scheduler that the settings name, or that its file holds.
+
+    Raises
+    ------
+    ClusterError
+        Where the file cannot be used.
+    """
+    if settings.scheduler:
+        return settings.scheduler
+    name = str(settings.scheduler_file)
     try:
-        json.loads(Path(name).read_text(encoding="utf-8"))["address"]
+        return str(json.loads(Path(name).read_text(encoding="utf-8"))["address"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ClusterError(
             "the scheduler file cannot be used",
@@ -238,4 +292,3 @@ def _scheduler_file(name: str) -> str:
             str(error),
             "Check its path, and that the scheduler has started",
         ) from error
-    return name

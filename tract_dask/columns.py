@@ -18,14 +18,7 @@ from .kernels.fitting import GaussianFits, fit_gaussians
 from .kernels.peaks import centroids, climb
 from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .schema import Status
-from .seeds import (
-    column_dataset,
-    lattice_columns,
-    positions,
-    read_columns_csv,
-    settings_lattices,
-    write_columns_csv,
-)
+from .seeds import column_dataset, lattice_columns, positions, read_columns_csv, settings_lattices, write_columns_csv
 from .settings import ColumnSettings
 from .windows import check_window, default_window, neighbour_distance
 

@@ -35,6 +35,7 @@ from .provenance import stage_key
 from .seeds import column_dataset, positions
 from .settings import ColumnSettings
 from .shards import Payload, Shard
+from .stores import load_array
 from .windows import default_window
 
 Floats = NDArray[np.floating[Any]]
@@ -305,7 +306,7 @@ def _in_movie(
         done = stage.journal("detections", stage_key(movie.key, repr(detector), template, repr(movie.shape)))
         stage.begin([(done, movie.shards)])
         stage.run(partial(_detect_shard, movie, detector, done.path), movie.shards, done)
-        found = np.concatenate([np.load(done.path / f"{shard.index}.npy") for shard in movie.shards])
+        found = np.concatenate([load_array(done.path / f"{shard.index}.npy") for shard in movie.shards])
         found[:, 1:3] -= shift[found[:, 0].astype(np.int64)]
         stage.end(f"{len(found) / movie.n_frames:.1f} a frame")
     return found

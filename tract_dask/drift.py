@@ -46,6 +46,7 @@ from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
 from .shards import Payload, Shard, Shards, split
+from .stores import load_array
 
 Bools = NDArray[np.bool_]
 
@@ -246,7 +247,7 @@ class Track:
     @classmethod
     def load(cls, path: Path, shard: Shard) -> Track:
         """Return the part of a saved track that belongs to a shard."""
-        table = np.load(path, mmap_mode="r")[shard.start : shard.stop]
+        table = load_array(path, mmap_mode="r")[shard.start : shard.stop]
         return cls(np.array(table[:, :2]), table[:, 2:4].astype(np.int64), table[:, 4] > 0)
 
 
@@ -435,7 +436,7 @@ def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], 
             continue
         here = slice(shard.start, shard.stop)
         first, final = np.flatnonzero(trusted)[[0, -1]]
-        total, exposure = np.load(folder / f"{shard.index}.npy")
+        total, exposure = load_array(folder / f"{shard.index}.npy")
         guess = last - drift[first] if track.trusted.any() else np.zeros(2)
         small = fold_image(total / np.float32(max(1.0, exposure.max())), level.search_fold)
         offset, _ = follower.follow(small, guess)
@@ -453,7 +454,7 @@ def _add_up(level: Level, places: Whole, folder: Path) -> Image:
     """Return the sum of all shards and how many frames cover each of its pixels, (2, y, x)."""
     total = np.zeros((2, *level.shape), np.float32)
     for index, place in enumerate(places):
-        add_shifted(total, np.load(folder / f"{index}.npy"), place)
+        add_shifted(total, load_array(folder / f"{index}.npy"), place)
     return total
 
 
@@ -474,9 +475,9 @@ def _refine_shard(movie: Movie, level: Level, follow: Path, folder: Path, shard:
 
 def _mean_of_others(level: Level, follow: Path, folder: Path, shard: Shard) -> Template:
     """Return the mean of all shards but one; of all, where there is no other."""
-    every, place = np.load(folder / "sum.npy"), np.load(folder / "places.npy")[shard.index]
+    every, place = load_array(folder / "sum.npy"), load_array(folder / "places.npy")[shard.index]
     others = every.copy()
-    add_shifted(others, -np.load(follow / f"{shard.index}.npy"), place)
+    add_shifted(others, -load_array(follow / f"{shard.index}.npy"), place)
     total, exposure = others if others[1].any() else every
     return Template(total, exposure, level.spectrum.frequency, level.spectrum.gain(max(1.0, float(exposure.max()))))
 

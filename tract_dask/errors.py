@@ -76,3 +76,7 @@ class MissingStoreError(StoreError):
 
 class ClusterError(TractError):
     """The scheduler or its workers cannot do the work."""
+
+
+class ServiceError(TractError):
+    """The service cannot be reached, or its answer cannot be understood."""

@@ -13,20 +13,9 @@ from typing import Any, TypeVar
 import click
 
 from . import settings as declared
-from .settings import RunSettings, Settings
+from .settings import TITLES, RunSettings, Settings
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-TITLES = {
-    "source": "Reading",
-    "metadata": "Metadata (otherwise as the file says)",
-    "convert": "Conversion",
-    "drift": "Drift",
-    "columns": "Columns",
-    "fit": "Fit",
-    "cluster": "Cluster (otherwise a local one)",
-}
-"""Headings of the groups of options, by the name of the group in :class:`RunSettings`."""
 
 IMPLIED = {("columns", "csv"): "csv", ("columns", "lattices"): "lattice", ("drift", "csv"): "csv"}
 """Settings that say which method is meant where none is given."""
@@ -90,7 +79,8 @@ def setting_options(*groups: str) -> Callable[[F], F]:
         @functools.wraps(function)
         def command(*args: Any, config: Path | None, **values: Any) -> Any:
             given = {name: values.pop(name) for name in list(values) if "__" in name}
-            return function(*args, settings=collect(given, config), **values)
+            settings = collect(given, config, values.pop("cluster_file", None))
+            return function(*args, settings=settings, **values)
 
         decorated: Any = command
         for group in reversed(groups):
@@ -153,7 +143,7 @@ def class_options(
     return decorate
 
 
-def collect(given: dict[str, Any], config: Path | None = None) -> RunSettings:
+def collect(given: dict[str, Any], config: Path | None = None, cluster_file: Path | None = None) -> RunSettings:
     """Return the settings in the file ``config``, or the defaults, with those options in their place that were given.
 
     Parameters
@@ -162,6 +152,8 @@ def collect(given: dict[str, Any], config: Path | None = None) -> RunSettings:
         Values by ``group__name``; None where the option was not given.
     config
         A TOML file.
+    cluster_file
+        A TOML file of the cluster's settings alone, which replaces what ``config`` says of it.
 
     Raises
     ------
@@ -174,6 +166,8 @@ def collect(given: dict[str, Any], config: Path | None = None) -> RunSettings:
     'csv'
     """
     settings = declared.load(config) if config else RunSettings()
+    if cluster_file:
+        settings = dataclasses.replace(settings, cluster=declared.load_cluster(cluster_file))
     changes: dict[str, dict[str, Any]] = {}
     if given.pop("drift__off", False):
         given["drift__method"] = "none"
@@ -196,12 +190,21 @@ def _group_options(name: str) -> list[Callable[[Any], Any]]:
         options.append(
             click.option("--no-drift", "drift__off", is_flag=True, cls=heading, help="Same as --drift none.")
         )
+    if name == "cluster":
+        options.insert(0, _cluster_option(heading))
     return options
 
 
+def _cluster_option(cls: type[click.Option]) -> Callable[[Any], Any]:
+    path = click.Path(dir_okay=False, path_type=Path)
+    text = "TOML file of the cluster: SLURM, ssh and more (docs/deploy.md); options override it."
+    return click.option("--cluster", "cluster_file", type=path, cls=cls, help=text)
+
+
 def _fields(kind: type[Settings]) -> list[tuple[dataclasses.Field[Any], Any]]:
+    """Return the settings of a class that have an option, with their types."""
     kinds = typing.get_type_hints(kind)
-    return [(field, kinds[field.name]) for field in dataclasses.fields(kind)]
+    return [(field, kinds[field.name]) for field in dataclasses.fields(kind) if not field.metadata["in_files_only"]]
 
 
 def _option(group: str, field: tuple[dataclasses.Field[Any], Any], cls: type[click.Option]) -> Callable[[Any], Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -25,7 +24,20 @@ from .fit import FitSummary
 from .io import FrameSource, open_source
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
-from .progress import Event, JsonLines, RunDone, RunStarted, Sink, StageDone, Warned, silent, tee
+from .progress import (
+    REPORT,
+    STAGES,
+    Event,
+    JsonLines,
+    RunDone,
+    RunStarted,
+    Sink,
+    StageDone,
+    StageStarted,
+    Warned,
+    silent,
+    tee,
+)
 from .seeds import read_columns_csv
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import journal_beside, split
@@ -143,7 +155,7 @@ class RunOutcome:
     Attributes
     ----------
     state
-        ``planned``, ``done`` or ``done_with_bad_frames``.
+        ``planned``, ``stopped`` (after the stage that was asked for), ``done`` or ``done_with_bad_frames``.
     seconds
         Time of every stage that worked, in s.
     reused
@@ -197,6 +209,8 @@ def run(
     overwrite: bool = False,
     plan_only: bool = False,
     report: bool = True,
+    until: str | None = None,
+    patience_s: float = 0.0,
 ) -> RunOutcome:
     """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
 
@@ -212,13 +226,18 @@ def run(
     client
         The cluster to run on; None: the one that ``settings.cluster`` names, if there is anything to do.
     on_event
-        Takes the run's progress.
+        Takes the run's progress. What it raises ends the run, which goes on from there as after any other error.
     overwrite
         Begin anew, even where the folder holds something else.
     plan_only
         Only plan, and write nothing.
     report
         Write ``report.html`` at the end, where it is not there yet or of other tracks.
+    until
+        The stage to stop after, one of :data:`tract_dask.progress.STAGES`; the same call without it goes on. After
+        ``columns``, the table can be edited first.
+    patience_s
+        How long to wait for another run in the same folder to end, in s.
 
     Raises
     ------
@@ -231,16 +250,17 @@ def run(
     """
     settings = _absolute(settings or RunSettings())
     outputs = Outputs(Path(output).absolute())
+    _check_stage(until)
     with closing(_open(source, settings)) as opened:
-        _check_inputs(opened, settings)
+        check_inputs(opened, settings)
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
             return RunOutcome(outputs, plan, "planned", plan.frames)
-        _check_output(outputs, opened, overwrite=overwrite)
-        with _sole_run(outputs):
+        check_output(outputs, opened, overwrite=overwrite)
+        with sole_run(outputs, patience_s):
             if overwrite:
-                _clear(outputs)
-            return _run(opened, outputs, settings, client, on_event, report=report)
+                clear_run(outputs)
+            return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
 def run_convert(
@@ -289,7 +309,7 @@ def run_columns(
     _check_suffix(path, ".csv")
     shift = None if drift is None else stores.open_dataset(Path(drift))
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
-        summed = sum_stage(opened, shift, _sum_of(path), session.workers, session.send)
+        summed = sum_stage(opened, shift, sum_beside(path), session.workers, session.send)
         return columns_stage(summed, path, settings.columns, settings.fit, session.send, overwrite=overwrite)
 
 
@@ -311,7 +331,7 @@ def run_fit(
     chosen = dataclasses.replace(settings.columns, method="csv", csv=str(table))
     read_columns_csv(table)
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
-        summed = sum_stage(opened, shift, _sum_of(path), session.workers, session.send)
+        summed = sum_stage(opened, shift, sum_beside(path), session.workers, session.send)
         found = columns_stage(summed, path.with_name(f"{path.stem}_columns.csv"), chosen, settings.fit, session.send)
         refine = _refine_columns(settings)
         return fit_stage(opened, found, shift, summed, path, settings.fit, refine, session.workers, session.send)
@@ -325,31 +345,35 @@ def _run(
     on_event: Sink,
     *,
     report: bool,
+    until: str | None,
 ) -> RunOutcome:
-    """Run the stages in their order."""
-    record = _Record()
+    """Run the stages in their order, and stop after ``until``."""
+    record, made = _Record(), _Made()
     send = tee((record, JsonLines(outputs.events), on_event))
     plan = plan_run(source.shape, source.dtype, settings)
     with _Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
         stores.write_aside(outputs.settings, _run_toml(settings, {}).encode())
-        movie = convert_stage(source, outputs.movie, settings, session.workers, send, overwrite=True)
-        drift = drift_stage(movie, outputs.drift, settings.drift, session.workers, send)
-        summed = sum_stage(movie, drift, outputs.sum, session.workers, send)
-        columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
-        refine = _refine_columns(settings)
-        summary = fit_stage(movie, columns, drift, summed, outputs.results, settings.fit, refine, session.workers, send)
+        for stage in _stages(source, outputs, settings, session, made):
+            if stage == until:
+                break
         session.finish_aside()
-        stores.write_aside(outputs.settings, _run_toml(settings, _resolved(movie, columns, outputs)).encode())
-        if report:
-            _report(outputs, send)
-        session.state = "done_with_bad_frames" if summary.bad_frames else "done"
-        session.message = "" if record.seconds else "all was done before: nothing to do"
+        if made.movie is None or made.summary is None:
+            session.state = "stopped"
+        else:
+            stores.write_aside(
+                outputs.settings, _run_toml(settings, _resolved(made.movie, made.columns, outputs)).encode()
+            )
+            session.state = "done_with_bad_frames" if made.summary.bad_frames else "done"
+            session.message = "" if record.seconds else "all was done before: nothing to do"
+            if report:
+                _report(outputs, send)
+    summary = made.summary or FitSummary(0, 0, 0)
     return RunOutcome(
         outputs,
         plan,
         session.state,
         plan.frames,
-        columns.sizes["column_id"],
+        made.columns.sizes.get("column_id", 0),
         summary.fits,
         summary.accepted,
         summary.bad_frames,
@@ -358,16 +382,48 @@ def _run(
     )
 
 
+@dataclass
+class _Made:
+    """What the stages of a run have made so far."""
+
+    movie: Movie | None = None
+    columns: xr.Dataset = field(default_factory=xr.Dataset)
+    summary: FitSummary | None = None
+
+
+def _stages(
+    source: FrameSource, outputs: Outputs, settings: RunSettings, session: _Session, made: _Made
+) -> Iterator[str]:
+    """Run the stages one by one; yield the name of each when it is done."""
+    workers, send = session.workers, session.send
+    made.movie = movie = convert_stage(source, outputs.movie, settings, workers, send, overwrite=True)
+    yield "convert"
+    drift = drift_stage(movie, outputs.drift, settings.drift, workers, send)
+    yield "drift"
+    summed = sum_stage(movie, drift, outputs.sum, workers, send)
+    yield "sum"
+    columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
+    made.columns = columns
+    yield "columns"
+    refine = _refine_columns(settings)
+    made.summary = fit_stage(movie, columns, drift, summed, outputs.results, settings.fit, refine, workers, send)
+    yield "fit"
+
+
 def _report(outputs: Outputs, send: Sink) -> None:
     """Write the report, if there is none of these tracks; whatever goes wrong, the tracks are done."""
     from .report import is_current, write_report  # takes its time to import
 
+    send(StageStarted(REPORT, 0))
+    began, current = perf_counter(), False
     try:
-        if not is_current(outputs.root):
+        current = is_current(outputs.root)
+        if not current:
             write_report(outputs.root, figures=False)
     except Exception as error:  # noqa: BLE001  nothing in a page of figures may undo a finished run
         stores.remove(outputs.report)  # it would be of other tracks
         send(Warned(f"the report could not be made: {error}"))
+    send(StageDone(REPORT, perf_counter() - began, reused=current))
 
 
 class _Session:
@@ -448,7 +504,8 @@ def _open(source: str | Path, settings: RunSettings) -> FrameSource:
     return open_source(str(Path(source).absolute()), settings.source, settings.metadata)
 
 
-def _sum_of(path: Path) -> Path:
+def sum_beside(path: Path) -> Path:
+    """Return where the summed image lies from which the table or the results at ``path`` were made."""
     return path.with_name(f"{path.stem}_sum.zarr")
 
 
@@ -465,6 +522,7 @@ def _check_suffix(path: Path, suffix: str) -> None:
 
 def _absolute(settings: RunSettings) -> RunSettings:
     """Return the settings with whole paths, so that they mean the same from any folder."""
+    cluster = settings.cluster
 
     def whole(path: str | None) -> str | None:
         return None if path is None else str(Path(path).absolute())
@@ -473,11 +531,11 @@ def _absolute(settings: RunSettings) -> RunSettings:
         settings,
         drift=dataclasses.replace(settings.drift, csv=whole(settings.drift.csv)),
         columns=dataclasses.replace(settings.columns, csv=whole(settings.columns.csv)),
-        cluster=dataclasses.replace(settings.cluster, scheduler_file=whole(settings.cluster.scheduler_file)),
+        cluster=dataclasses.replace(cluster, scheduler_file=whole(cluster.scheduler_file), tls=whole(cluster.tls)),
     )
 
 
-def _check_inputs(source: FrameSource, settings: RunSettings) -> None:
+def check_inputs(source: FrameSource, settings: RunSettings) -> None:
     """Read the small inputs once, so that a fault in them is found before any work."""
     if settings.drift.method == "csv":
         read_drift_csv(_required(settings.drift.csv, "--drift-csv"), source.shape[0])
@@ -491,13 +549,18 @@ def _check_inputs(source: FrameSource, settings: RunSettings) -> None:
     local_memory_limit(settings.cluster)
 
 
+def _check_stage(until: str | None) -> None:
+    if until is not None and until not in STAGES:
+        raise InputError("there is no such stage", "until", f"one of {', '.join(STAGES)}", until, "Correct its name")
+
+
 def _required(path: str | None, option: str) -> Path:
     if path is None:
         raise InputError("method csv needs a file", "settings", option, "none", f"Give one with {option}")
     return Path(path)
 
 
-def _check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> None:
+def check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> None:
     """Check that the folder is empty or holds a run of this movie, and can be written."""
     root = outputs.root
     ours = outputs.settings.exists() or outputs.events.exists()
@@ -526,7 +589,7 @@ def _check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> 
     stores.check_destination(outputs.movie, overwrite=overwrite)
 
 
-def _clear(outputs: Outputs) -> None:
+def clear_run(outputs: Outputs) -> None:
     """Delete what a run writes, and nothing else."""
     stages = (outputs.movie, outputs.drift, outputs.sum, outputs.columns.with_suffix(".zarr"), outputs.results)
     for path in stages:
@@ -538,30 +601,23 @@ def _clear(outputs: Outputs) -> None:
 
 
 @contextmanager
-def _sole_run(outputs: Outputs) -> Iterator[None]:
-    """Hold the folder against a second run; the lock ends with the process, however that ends."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
+def sole_run(outputs: Outputs, patience_s: float = 0.0) -> Iterator[None]:
+    """Hold the folder against a second run, after waiting at most ``patience_s`` for one that holds it.
 
-    with (outputs.root / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DestinationError(
-                "another run works in this folder",
-                str(outputs.root),
-                remedy="Wait for it, stop it, or choose another place",
-            ) from error
+    Raises
+    ------
+    DestinationError
+        Where another run holds it.
+    """
+    with stores.sole_use(outputs.root / ".lock", "another run works in this folder", patience_s):
         yield
 
 
 def _expected_limit(settings: RunSettings, client: Client | None) -> int | None:
     """Return the bytes that a task may use, without starting workers."""
     cluster = settings.cluster
-    if client is None and not (cluster.scheduler or cluster.scheduler_file):
-        return local_memory_limit(cluster)
+    if client is None and cluster.resolved_kind != "address":
+        return local_memory_limit(cluster) // cluster.threads
     with closing(LazyClient(cluster, client)) as workers:
         return memory_budget(workers())
 

@@ -13,6 +13,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
 
+STAGES = ("convert", "drift", "sum", "columns", "fit")
+"""The stages of a run, in their order."""
+
+REPORT = "report"
+"""What a run makes after its stages."""
+
 
 @dataclass(frozen=True)
 class RunStarted:
@@ -67,7 +73,7 @@ class Warned:
 
 @dataclass(frozen=True)
 class RunDone:
-    """The run ended; ``state`` is done, done_with_bad_frames, interrupted or failed."""
+    """The run ended; ``state`` is done, done_with_bad_frames, stopped, interrupted or failed."""
 
     state: str
     seconds: float

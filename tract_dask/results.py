@@ -7,6 +7,7 @@ that tasks need nothing but its path, and a viewer can open it while the fits st
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,16 @@ from .errors import MissingStoreError, SettingsError
 from .schema import REJECTED, Status
 from .settings import FitSettings, from_toml
 from .shard_files import BLOSC, encode
-from .shards import Shard
+from .shards import Shard, entries, journal_beside
 
 _CODEC = "lz4"
-_FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
+FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
+"""The variables that :func:`accepted` masks."""
+
 _KNOWN_AT_START = ("drift_measured", "time")
+SHARDED = tuple(name for name in schema.RESULTS if name not in _KNOWN_AT_START)
+"""The variables of which every shard of the movie makes one chunk."""
+
 _CHUNK_BYTES = 32 << 20
 """Stored chunks are opened in groups, of so many bytes of ``fit``: small ones would be a task each."""
 
@@ -63,19 +69,18 @@ def create(
         stores.remove(aside)
         static.to_zarr(aside, mode="w", zarr_format=3, consolidated=False)
         group = zarr.open_group(str(aside), mode="a")
-        for variable in schema.RESULTS.values():
-            if variable.name not in _KNOWN_AT_START:
-                shape = tuple(sizes[dim] for dim in variable.dims)
-                group.create_array(
-                    variable.name,
-                    shape=shape,
-                    chunks=(min(frames_per_shard, shape[0]), *shape[1:]),
-                    dtype=variable.dtype,
-                    compressors=BloscCodec(**BLOSC[_CODEC]),
-                    fill_value=variable.fill,
-                    dimension_names=variable.dims,
-                    attributes=variable.attributes,
-                )
+        for variable in map(schema.RESULTS.__getitem__, SHARDED):
+            shape = tuple(sizes[dim] for dim in variable.dims)
+            group.create_array(
+                variable.name,
+                shape=shape,
+                chunks=(min(frames_per_shard, shape[0]), *shape[1:]),
+                dtype=variable.dtype,
+                compressors=BloscCodec(**BLOSC[_CODEC]),
+                fill_value=variable.fill,
+                dimension_names=variable.dims,
+                attributes=variable.attributes,
+            )
         stores.remove(path)
         aside.replace(path)
 
@@ -102,6 +107,28 @@ def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
         stores.update_attributes(path, **about)
 
 
+def finished_shards(path: Path) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return which shards of the store at ``path`` are done, (shards,); of a finished store, all.
+
+    Those that are not may hold values already: of a task that was killed before its entry in the journal.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there are no results.
+    """
+    about = stores.attributes(path)
+    if not (path / "fit").is_dir():
+        raise _nothing_here(path)
+    fit = stores.open_array(path / "fit")
+    done = np.full(-(-fit.shape[0] // fit.chunks[0]), bool(about.get("complete")))
+    journal = journal_beside(path)
+    with suppress(FileNotFoundError):
+        if not done.all() and (journal / "key").read_text(encoding="utf-8") == about.get("key"):
+            done[[index for index, _ in entries(journal) if index < len(done)]] = True
+    return done
+
+
 def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     """Return the tracks at ``path`` as a lazy Dataset over (frame, column_id, parameter).
 
@@ -120,9 +147,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     path = Path(path)
     about = stores.attributes(path)
     if not (path / "fit").is_dir():
-        raise MissingStoreError(
-            "there are no results here", str(path), "a results.zarr", remedy="Make it with tract-dask run"
-        )
+        raise _nothing_here(path)
     if not about.get("complete") and not unfinished:
         raise MissingStoreError(
             "the fits are not all done",
@@ -147,6 +172,12 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     settings = from_toml(FitSettings, about["settings"], str(path))
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
     return dataset
+
+
+def _nothing_here(path: Path) -> MissingStoreError:
+    return MissingStoreError(
+        "there are no results here", str(path), "a results.zarr", remedy="Make it with tract-dask run"
+    )
 
 
 def how_fitted(settings: FitSettings, window: int, reference_blur_px: float) -> dict[str, Any]:
@@ -204,4 +235,4 @@ def accepted(dataset: xr.Dataset, threshold: float | None = None) -> xr.Dataset:
         weak = ~(abs(dataset["fit"].sel(parameter="amplitude", drop=True)) > threshold * dataset["noise"])
         status = (status & ~np.uint8(Status.BELOW_NOISE)) | (weak * np.uint8(Status.BELOW_NOISE))
     good = (status & np.uint8(REJECTED)) == 0
-    return dataset.assign({name: dataset[name].where(good) for name in _FITTED} | {"status": status})
+    return dataset.assign({name: dataset[name].where(good) for name in FITTED} | {"status": status})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -174,35 +175,47 @@ def settings_lattices(lattices: Sequence[Any]) -> list[xr.Dataset]:
     return found
 
 
-def write_columns_csv(columns: xr.Dataset, path: str | Path) -> None:
-    """Write columns as CSV: column_id, x, y, kind, the fit's other parameters, and the flags by name.
+def columns_csv(columns: xr.Dataset) -> str:
+    """Return columns as CSV: column_id, x, y, kind, the fit's other parameters, and the flags by name.
 
-    Numbers keep their full precision; :func:`read_columns_csv` gives back what was written.
+    Numbers keep their full precision; :func:`parse_columns_csv` gives back what was written.
     """
     fits = columns["fit_ref"].sel(parameter=list(_FIT_COLUMNS)).to_numpy()
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["column_id", "x", "y", "kind", *_FIT_COLUMNS, "flags"])
-        for column, (x, y), kind, fit, status in zip(
-            columns["column_id"].to_numpy(),
-            positions(columns),
-            columns["kind"].to_numpy(),
-            fits,
-            columns["status_ref"].to_numpy(),
-            strict=True,
-        ):
-            numbers = [repr(float(value)) if np.isfinite(value) else "" for value in fit]
-            flags = " ".join(str(flag.name).lower() for flag in Status if flag and int(status) & flag)
-            writer.writerow([int(column), repr(float(x)), repr(float(y)), str(kind), *numbers, flags])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["column_id", "x", "y", "kind", *_FIT_COLUMNS, "flags"])
+    for column, (x, y), kind, fit, status in zip(
+        columns["column_id"].to_numpy(),
+        positions(columns),
+        columns["kind"].to_numpy(),
+        fits,
+        columns["status_ref"].to_numpy(),
+        strict=True,
+    ):
+        numbers = [repr(float(value)) if np.isfinite(value) else "" for value in fit]
+        flags = " ".join(flag_names(int(status)))
+        writer.writerow([int(column), repr(float(x)), repr(float(y)), str(kind), *numbers, flags])
+    return text.getvalue()
+
+
+def flag_names(status: int) -> list[str]:
+    """Return the names of the flags that are set.
+
+    Examples
+    --------
+    >>> flag_names(9)
+    ['below_noise', 'outside_frame']
+    """
+    return [str(flag.name).lower() for flag in Status if flag and status & flag]
+
+
+def write_columns_csv(columns: xr.Dataset, path: str | Path) -> None:
+    """Write columns to a CSV file, as :func:`columns_csv` gives them."""
+    Path(path).write_text(columns_csv(columns), encoding="utf-8", newline="")
 
 
 def read_columns_csv(path: str | Path) -> xr.Dataset:
-    """Return the columns of a CSV file.
-
-    Its first line names the columns: ``x`` and ``y`` (px) must be there, ``column_id`` (whole numbers from 0 on, each
-    once) and ``kind`` may be; a fit and flags are read where :func:`write_columns_csv` has written them, others are
-    ignored. Without IDs the columns are numbered from 1 in the order of the file. Empty lines and those that begin
-    with ``#`` are skipped.
+    """Return the columns of a CSV file, as :func:`parse_columns_csv` understands it.
 
     Raises
     ------
@@ -210,8 +223,35 @@ def read_columns_csv(path: str | Path) -> xr.Dataset:
         Where the file cannot be read or is empty, x or y is missing, a number is none, or an ID comes twice; naming
         the line.
     """
-    header, rows = _read_rows(path)
-    numbers = [_Row(path, line, dict(zip(header, row, strict=False))) for line, row in rows]
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unreadable(str(path), error) from error
+    return parse_columns_csv(text, str(path))
+
+
+def parse_columns_csv(text: str, where: str) -> xr.Dataset:
+    """Return the columns of a CSV table.
+
+    Its first line names the columns: ``x`` and ``y`` (px) must be there, ``column_id`` (whole numbers from 0 on, each
+    once) and ``kind`` may be; a fit and flags are read where :func:`columns_csv` has written them, others are
+    ignored. Without IDs the columns are numbered from 1 in the order of the table. Empty lines and those that begin
+    with ``#`` are skipped.
+
+    Parameters
+    ----------
+    text
+        The table.
+    where
+        What to call it in errors.
+
+    Raises
+    ------
+    SettingsError
+        As :func:`read_columns_csv`.
+    """
+    header, rows = _rows(text, where)
+    numbers = [_Row(where, line, dict(zip(header, row, strict=False))) for line, row in rows]
     places = [[row.number("x"), row.number("y")] for row in numbers]
     ids = [row.integer("column_id") for row in numbers] if "column_id" in header else None
     first: dict[int, int] = {}
@@ -219,7 +259,7 @@ def read_columns_csv(path: str | Path) -> xr.Dataset:
         if column in first:
             raise SettingsError(
                 "a column_id comes twice",
-                f"{path}, line {row.line}",
+                f"{where}, line {row.line}",
                 "each column_id once",
                 f"{column}, as in line {first[column]}",
                 "Number the columns anew, or leave column_id out",
@@ -235,36 +275,38 @@ def read_columns_csv(path: str | Path) -> xr.Dataset:
     return column_dataset(places, kinds, ids, fit, [row.flags() for row in numbers])
 
 
-def _read_rows(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of a CSV file's columns and its (line, values), stripped; x, y and one row are there."""
+def _unreadable(where: str, error: Exception) -> SettingsError:
+    what = "the columns file cannot be read"
+    return SettingsError(what, where, "a CSV file", str(error), "Check its path and format")
+
+
+def _rows(text: str, where: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the names of a table's columns and its (line, values), stripped; x, y and one row are there."""
+    reader = csv.reader(io.StringIO(text, newline=""))
     try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            lines = [(reader.line_num, [value.strip() for value in row]) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SettingsError(
-            "the columns file cannot be read", str(path), "a CSV file", str(error), "Check its path and format"
-        ) from error
+        lines = [(reader.line_num, [value.strip() for value in row]) for row in reader]
+    except csv.Error as error:
+        raise _unreadable(where, error) from error
     lines = [(line, row) for line, row in lines if any(row) and not row[0].startswith("#")]
     header = lines[0][1] if lines else []
     if not lines or not {"x", "y"} <= set(header):
         raise SettingsError(
             "the columns file does not say where the columns are" if lines else "the columns file is empty",
-            f"{path}, line {lines[0][0]}" if lines else str(path),
+            f"{where}, line {lines[0][0]}" if lines else where,
             "a first line that names the columns x and y, separated by commas",
             ", ".join(header) or "no line",
             "Name them in the first line: x,y or column_id,x,y,kind",
         )
     if len(lines) == 1:
-        raise SettingsError("the columns file is empty", str(path), "a row for each column", "the first line alone")
+        raise SettingsError("the columns file is empty", where, "a row for each column", "the first line alone")
     return header, lines[1:]
 
 
 class _Row:
-    """One row of a CSV file that knows its line."""
+    """One row of a table that knows its line."""
 
-    def __init__(self, path: str | Path, line: int, values: dict[str, str]) -> None:
-        self.path, self.line, self.values = path, line, values
+    def __init__(self, where: str, line: int, values: dict[str, str]) -> None:
+        self.where, self.line, self.values = where, line, values
 
     def number(self, name: str) -> float:
         try:
@@ -290,4 +332,4 @@ class _Row:
 
     def _error(self, name: str, expected: str) -> SettingsError:
         got = repr(self.values[name]) if name in self.values else "nothing"
-        return SettingsError(f"{name} cannot be read", f"{self.path}, line {self.line}", expected, got, "Correct it")
+        return SettingsError(f"{name} cannot be read", f"{self.where}, line {self.line}", expected, got, "Correct it")

@@ -7,9 +7,11 @@ and the checks come from that declaration.
 from __future__ import annotations
 
 import dataclasses
+import re
 import tomllib
 import types
 import typing
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +21,10 @@ import tomli_w
 from .errors import SettingsError
 
 T = TypeVar("T")
+
+_LINE = r"[^\n\r]+"
+_WORD = r"[A-Za-z0-9_.:,@+-]+"
+_WORD_FORM = "letters, digits and _ . : , @ + -"
 
 
 def setting(
@@ -30,10 +36,14 @@ def setting(
     high: float | None = None,
     choices: tuple[str, ...] = (),
     flag: str = "",
+    pattern: str = "",
+    form: str = "",
+    in_files_only: bool = False,
 ) -> Any:
     """Declare a setting: a dataclass field that carries its documentation and its range.
 
-    ``flag`` names its option on the command line where that is not simply the field's name with dashes.
+    ``flag`` names its option on the command line where that is not simply the field's name with dashes; a setting that
+    is ``in_files_only`` has none. Text, or each text of a list, has to match ``pattern``, which ``form`` puts in words.
     """
     return field(
         default=default,
@@ -44,8 +54,16 @@ def setting(
             "high": high,
             "choices": choices,
             "flag": flag,
+            "pattern": pattern,
+            "form": form,
+            "in_files_only": in_files_only,
         },
     )
+
+
+def _subgroup(description: str) -> dict[str, Any]:
+    """Return what a field that is a group of settings inside another carries: only a file can set it."""
+    return dict(setting(None, description, in_files_only=True).metadata)
 
 
 @dataclass(frozen=True)
@@ -291,15 +309,148 @@ class FitSettings(Settings):
 
 
 @dataclass(frozen=True)
+class SlurmSettings(Settings):
+    """What is asked of SLURM for every job that holds workers."""
+
+    queue: str | None = setting(None, "Partition", pattern=_WORD, form=_WORD_FORM)
+    account: str | None = setting(None, "Account that is charged", pattern=_WORD, form=_WORD_FORM)
+    walltime: str = setting(
+        "01:00:00",
+        "Time that a job may take; one that ends is followed by another while there is work",
+        pattern=r"(\d+-)?\d+(:\d\d){0,2}",
+        form="minutes, hours:minutes:seconds or days-hours, such as 02:00:00",
+    )
+    workers_per_job: int = setting(1, "Worker processes in one job, on one node", low=1, high=1024)
+    directives: tuple[str, ...] = setting(
+        (),
+        "More options of sbatch, such as --constraint=avx512",
+        pattern=r"-[^\n\r]+",
+        form="options that begin with a dash",
+    )
+    prologue: tuple[str, ...] = setting(
+        (),
+        "Lines of shell that a job runs first, such as module load python",
+        pattern=_LINE,
+        form="single lines",
+    )
+    log_directory: str | None = setting(
+        None,
+        "Folder for what jobs print, which has to exist on the nodes; unset: the working folder",
+        pattern=_LINE,
+        form="a path",
+    )
+
+
+@dataclass(frozen=True)
+class SshSettings(Settings):
+    """Which machines are reached by ssh, and how."""
+
+    hosts: tuple[str, ...] = setting(
+        (),
+        "Machines that workers are started on, as ssh names them; the file ~/.ssh/config holds for them",
+        pattern=r"[A-Za-z0-9_.:@\[\]][A-Za-z0-9_.:@%\[\]-]*",
+        form="names such as node1 or user@node1",
+    )
+    options: tuple[str, ...] = setting(
+        (), "More arguments of ssh, such as -p and 2222", pattern=_LINE, form="single arguments"
+    )
+
+
+@dataclass(frozen=True)
 class ClusterSettings(Settings):
     """Where the work runs; no result depends on it."""
 
+    kind: str | None = setting(
+        None,
+        "What starts the workers: this machine, somebody else, SLURM or ssh; unset: local, or address if one is given",
+        choices=("local", "address", "slurm", "ssh"),
+        in_files_only=True,
+    )
     scheduler: str | None = setting(None, "Address of a running Dask scheduler")
     scheduler_file: str | None = setting(None, "Scheduler file of a running Dask scheduler")
-    workers: int | None = setting(None, "Worker processes of the local cluster; unset: one a core", low=1, high=4096)
-    memory_limit: str | None = setting(
-        None, "Memory of each local worker, such as 2GB; unset: its share of the machine"
+    workers: int | None = setting(
+        None,
+        "Worker processes: of the local cluster or of each ssh host (unset: one a core), or of all SLURM jobs",
+        low=1,
+        high=4096,
     )
+    min_workers: int | None = setting(
+        None,
+        "Workers that SLURM keeps while there is no work, down from as many as workers says; unset: all of them",
+        low=0,
+        high=4096,
+        in_files_only=True,
+    )
+    memory_limit: str | None = setting(
+        None, "Memory of each worker that we start, such as 2GB; unset: its share of the machine"
+    )
+    threads: int = setting(
+        1, "Threads of each worker that we start: tasks that share its memory", low=1, high=256, in_files_only=True
+    )
+    tls: str | None = setting(
+        None,
+        "Folder of certificates (tract-dask certs) with which everything between scheduler and workers is encrypted",
+    )
+    python: str | None = setting(
+        None,
+        "Interpreter of SLURM and ssh workers; unset: the path of this one",
+        pattern=_LINE,
+        form="a path on the nodes",
+        in_files_only=True,
+    )
+    interface: str | None = setting(
+        None,
+        "Network interface on which our scheduler listens for SLURM and ssh workers; unset: that of the default route",
+        pattern=_WORD,
+        form="a name such as eth0",
+        in_files_only=True,
+    )
+    local_directory: str | None = setting(
+        None,
+        "Scratch folder of the workers that we start; unset: the system's",
+        pattern=_LINE,
+        form="a path",
+        in_files_only=True,
+    )
+    patience_s: float | None = setting(
+        None,
+        "How long work waits for a worker when there is none; unset: 60, or a day with SLURM, where jobs queue",
+        unit="s",
+        low=1,
+        in_files_only=True,
+    )
+    slurm: SlurmSettings = field(default_factory=SlurmSettings, metadata=_subgroup("What is asked of SLURM"))
+    ssh: SshSettings = field(default_factory=SshSettings, metadata=_subgroup("Which machines are reached"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        named = [name for name in ("scheduler", "scheduler_file") if getattr(self, name)]
+        needed = {
+            "address": ("scheduler or scheduler_file", bool(named)),
+            "slurm": ("workers and memory_limit", bool(self.workers and self.memory_limit)),
+            "ssh": ("hosts in the table [ssh]", bool(self.ssh.hosts)),
+        }
+        what, found = needed.get(self.resolved_kind, ("", True))
+        if not found:
+            raise _contradiction("kind", what, f"kind = {self.kind!r} without", "Say them")
+        if named and self.resolved_kind != "address":
+            raise _contradiction(
+                named[0], "kind = 'address', or none", f"kind = {self.kind!r}", "Leave the scheduler or the kind out"
+            )
+        if self.min_workers is not None and self.min_workers > (self.workers or 0):
+            raise _contradiction(
+                "min_workers", f"at most workers, {self.workers}", str(self.min_workers), "Make it smaller"
+            )
+
+    @property
+    def resolved_kind(self) -> str:
+        """The kind that is set, or else the one that the other settings mean."""
+        return self.kind or ("address" if self.scheduler or self.scheduler_file else "local")
+
+    @property
+    def resolved_patience_s(self) -> float:
+        """How long work waits for a worker, in s: as set, or as is usual for the kind."""
+        return self.patience_s or (86400.0 if self.resolved_kind == "slurm" else 60.0)
 
 
 @dataclass(frozen=True)
@@ -313,6 +464,18 @@ class RunSettings(Settings):
     columns: ColumnSettings = field(default_factory=ColumnSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     cluster: ClusterSettings = field(default_factory=ClusterSettings)
+
+
+TITLES = {
+    "source": "Reading",
+    "metadata": "Metadata (otherwise as the file says)",
+    "convert": "Conversion",
+    "drift": "Drift",
+    "columns": "Columns",
+    "fit": "Fit",
+    "cluster": "Cluster (otherwise a local one)",
+}
+"""Headings of the groups, by the name of the group in :class:`RunSettings`."""
 
 
 def to_dict(settings: Settings) -> dict[str, Any]:
@@ -383,8 +546,23 @@ def load(path: Path) -> RunSettings:
     SettingsError
         As :func:`from_toml`, and where the file cannot be read.
     """
+    return from_toml(RunSettings, _text(path), str(path))
+
+
+def load_cluster(path: Path) -> ClusterSettings:
+    """Return the settings of a cluster in a TOML file of its own.
+
+    Raises
+    ------
+    SettingsError
+        As :func:`load`.
+    """
+    return from_toml(ClusterSettings, _text(path), str(path))
+
+
+def _text(path: Path) -> str:
     try:
-        return from_toml(RunSettings, path.read_text(encoding="utf-8"), str(path))
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise SettingsError(
             "the settings file cannot be read", str(path), "a TOML file", str(error), "Check its path"
@@ -421,6 +599,8 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
             repr(value),
             meta["description"],
         )
+    if meta.get("pattern"):
+        _check_text(where, meta, (value,) if isinstance(value, str) else value)
     low, high = meta.get("low"), meta.get("high")
     if isinstance(value, int | float) and not ((low is None or value >= low) and (high is None or value <= high)):
         bounds = " and ".join(
@@ -438,3 +618,13 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
             repr(value),
             meta["description"],
         )
+
+
+def _check_text(where: str, meta: Mapping[str, Any], texts: Iterable[Any]) -> None:
+    for text in texts:
+        if not isinstance(text, str) or not re.fullmatch(meta["pattern"], text):
+            raise SettingsError("the text has another form", where, meta["form"], repr(text), meta["description"])
+
+
+def _contradiction(name: str, expected: str, got: str, remedy: str) -> SettingsError:
+    return SettingsError("settings contradict each other", f"setting {name} (ClusterSettings)", expected, got, remedy)

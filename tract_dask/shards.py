@@ -11,23 +11,31 @@ import os
 import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from time import monotonic, perf_counter
+from time import monotonic, perf_counter, sleep
 from typing import Any, TypeAlias, overload
 
+import dask
 import numpy as np
-from distributed import Client, as_completed
+from distributed import Client, Worker, as_completed
+from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
 from numpy.typing import NDArray
 
 from .errors import ClusterError
 from .stores import disk_errors, json_ready, remove, write_aside
 
+PATIENCE = "tract_dask.patience-s"
+"""Item of Dask's configuration: for how long, in s, work waits while the cluster has no worker."""
+
 _PATIENCE_S = 60.0
+_SETTLE_S = 15.0
+"""For so long an interrupted run waits for the tasks that are being executed."""
+
 _BATCH_S = 0.5
 """For so long a task goes on taking shards of its batch; a longer shard is a batch of its own."""
 
@@ -147,6 +155,11 @@ class Journal:
         remove(self.path)
 
 
+def patience_s() -> float:
+    """Return for how long work waits while the cluster has no worker, in s: as Dask is configured, or a minute."""
+    return float(dask.config.get(PATIENCE, _PATIENCE_S))
+
+
 def _nothing(shard: Shard, payload: Payload) -> None:
     pass
 
@@ -241,6 +254,22 @@ def _work(
     return payloads, perf_counter() - began
 
 
+class _Packed:
+    """Work that is unpacked where it is done.
+
+    What a task refers to, such as an open movie, is opened by unpacking it. The scheduler unpacks every task, and may
+    see none of the files.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work = dumps(work)
+
+    def __call__(self, batch: Numbers) -> tuple[list[Payload], float]:
+        """Unpack the work and do it."""
+        work: Work = loads(self._work)
+        return work(batch)
+
+
 def _run_here(work: Work, todo: Numbers) -> Finished:
     for k in range(len(todo)):
         (payload,), _ = work(todo[k : k + 1])
@@ -269,21 +298,24 @@ class _Queue:
 
 
 def _run_on(client: Client, work: Work, todo: Numbers, shards: Sequence[Shard], name: str) -> Finished:
-    """Keep a bounded window of batches in flight, so that neither driver nor scheduler grows with the movie."""
-    window = 4 * max(1, sum(client.nthreads().values())) + 4
-    token = uuid.uuid4().hex
-    queue, size = _Queue(todo), 1
+    """Keep a bounded window of batches in flight, so that neither driver nor scheduler grows with the movie.
+
+    The window grows with the cluster, whose workers may come one after the other.
+    """
+    group = f"{name}-{uuid.uuid4().hex}"
+    packed, queue, size = _Packed(work), _Queue(todo), 1
     running: dict[Any, Numbers] = {}
+    completed = as_completed()
+    crew = _Crew(client, running)
 
-    def submit() -> Any:
-        batch = queue.take(size)
-        future = client.submit(work, batch, key=(f"{name}-{token}", int(batch[0])), pure=False)
-        running[future] = batch
-        return future
+    def submit() -> None:
+        while queue.left and len(running) < crew.window:
+            batch = queue.take(size)
+            future = client.submit(packed, batch, key=(group, int(batch[0])), pure=False)
+            running[future] = batch
+            completed.add(future)
 
-    completed = as_completed([submit() for _ in range(min(window, queue.left))])
-    ended = Event()
-    Thread(target=_watch, args=(client, running, ended), daemon=True).start()
+    submit()
     try:
         for future in completed:
             batch = running[future]
@@ -291,14 +323,33 @@ def _run_on(client: Client, work: Work, todo: Numbers, shards: Sequence[Shard], 
                 payloads, seconds = future.result()  # waits anew where the worker that held it has gone
             del running[future]
             queue.give_back(batch[len(payloads) :])
-            size = _next_size(size, len(payloads) / max(seconds, 1e-6), queue.left // (2 * window))
-            if queue.left:
-                completed.add(submit())
+            size = _next_size(size, len(payloads) / max(seconds, 1e-6), queue.left // (2 * crew.window))
+            submit()
             yield from zip(batch.tolist(), payloads, strict=False)
     finally:
-        ended.set()
+        crew.ended.set()
         if running and client.status == "running":
             client.cancel(list(running), force=True)
+            _settle(client, group)
+
+
+def _settle(client: Client, group: str) -> None:
+    """Wait until no worker of a cluster that goes on is still at a task of ``group``, of which none is queued any more.
+
+    A running task cannot be stopped; what it writes must not come after what the next run does in the same place. A
+    cluster of our own (:attr:`distributed.Client.cluster`) is about to end with its tasks.
+    """
+    deadline = monotonic() + _SETTLE_S
+    with suppress(OSError):  # the cluster has gone
+        while client.cluster is None and any(client.run(_is_at, group, on_error="ignore").values()):
+            if monotonic() > deadline:
+                return
+            sleep(0.05)
+
+
+def _is_at(group: str, dask_worker: Worker) -> bool:
+    """Tell whether a worker executes a task of ``group``."""
+    return any(task.key[0] == group for task in dask_worker.state.executing)
 
 
 def _next_size(size: int, rate: float, share: int) -> int:
@@ -312,16 +363,33 @@ def _next_size(size: int, rate: float, share: int) -> int:
     return max(1, min(int(rate * _BATCH_S), 2 * size, share))
 
 
-def _watch(client: Client, running: Iterable[Any], ended: Event) -> None:
-    """Cancel what is running once the cluster has had no worker for a minute: nobody would ever finish it."""
-    alone_since = monotonic()
-    while not ended.wait(1.0):
-        if client.status != "running":
-            return
-        if client.nthreads():
-            alone_since = monotonic()
-        elif monotonic() - alone_since > _PATIENCE_S:
-            client.cancel(list(running), force=True)  # once more each second: the loop may have submitted another
+class _Crew:
+    """How many worker threads there are, looked at each second until ``ended`` is set.
+
+    Cancels what is running once the cluster has had no worker for too long: nobody would ever finish it.
+    """
+
+    def __init__(self, client: Client, running: Iterable[Any]) -> None:
+        self._client, self._running, self._patience_s = client, running, patience_s()
+        self._threads: int = sum(client.nthreads().values())
+        self.ended = Event()
+        Thread(target=self._watch, daemon=True).start()
+
+    @property
+    def window(self) -> int:
+        """How many batches may be in flight."""
+        return 4 * max(1, self._threads) + 4
+
+    def _watch(self) -> None:
+        alone_since = monotonic()
+        while not self.ended.wait(1.0):
+            if self._client.status != "running":
+                return
+            self._threads = sum(self._client.nthreads().values())
+            if self._threads:
+                alone_since = monotonic()
+            elif monotonic() - alone_since > self._patience_s:
+                self._client.cancel(list(self._running), force=True)  # each second: the loop may have submitted another
 
 
 @contextmanager

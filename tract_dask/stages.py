@@ -32,8 +32,6 @@ from .settings import ColumnSettings, DriftSettings, FitSettings, RunSettings, S
 from .shards import journal_beside
 from .summing import sum_image
 
-STAGES = ("convert", "drift", "sum", "columns", "fit")
-
 Workers = Callable[[], Client]
 """Gives the client; connects at its first call (:class:`tract_dask.cluster.LazyClient`)."""
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import shutil
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from time import monotonic, sleep
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 import zarr
+from numpy.typing import NDArray
 
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
@@ -26,7 +28,7 @@ ATTRIBUTE = "tract_dask"
 
 @contextmanager
 def codec_pipeline() -> Iterator[None]:
-    """Open arrays inside this block with the ``zarrs`` codec pipeline, where it is installed."""
+    """Open arrays inside this block with the ``zarrs`` codec pipeline, where it is installed; it reads faster."""
     if find_spec("zarrs") is None:
         yield
         return
@@ -34,8 +36,29 @@ def codec_pipeline() -> Iterator[None]:
         yield
 
 
-def open_array(path: Path, mode: str = "r") -> zarr.Array[Any]:
-    """Return the Zarr array at ``path``.
+@contextmanager
+def sole_parser() -> Iterator[None]:
+    """Let no other thread of this process parse Python source in this block, nor compile with Numba.
+
+    In CPython 3.11 (gh-106905) a thread that builds a syntax tree fails with "AST constructor recursion depth mismatch"
+    where another one does so at the same time. Numba builds them under the lock that is held here; numpy builds one for
+    the header of every .npy file that it reads.
+    """
+    from numba.core.compiler_lock import global_compiler_lock  # takes its time to import
+
+    with global_compiler_lock:
+        yield
+
+
+def load_array(path: Path, mmap_mode: Literal["r"] | None = None) -> NDArray[Any]:
+    """Return the array in a .npy file; safe where other threads of a worker read or compile."""
+    with sole_parser():
+        loaded: NDArray[Any] = np.load(path, mmap_mode=mmap_mode)
+    return loaded
+
+
+def open_array(path: Path) -> zarr.Array[Any]:
+    """Return the Zarr array at ``path``, to be read.
 
     Raises
     ------
@@ -44,7 +67,7 @@ def open_array(path: Path, mode: str = "r") -> zarr.Array[Any]:
     """
     try:
         with codec_pipeline():
-            return zarr.open_array(str(path), mode=mode, zarr_format=3)
+            return zarr.open_array(str(path), mode="r", zarr_format=3)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError) as error:
         raise StoreError("there is no Zarr array here", str(path), remedy="Run the stage that writes it") from error
 
@@ -145,6 +168,35 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
         ) from error
 
 
+@contextmanager
+def sole_use(lock: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
+    """Hold the file ``lock`` against other processes; the lock ends with the process, however that ends.
+
+    Raises
+    ------
+    DestinationError
+        Saying ``what`` another process does, where it holds the lock and still does after ``patience_s``.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    deadline = monotonic() + patience_s
+    with lock.open("w") as file:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if monotonic() >= deadline:
+                    raise DestinationError(
+                        what, str(lock.parent), remedy="Wait for it, stop it, or choose another place"
+                    ) from error
+            sleep(0.1)
+        yield
+
+
 def check_free_space(path: Path, needed: int) -> None:
     """Check that the disk under ``path`` has ``needed`` bytes free.
 
@@ -170,21 +222,16 @@ def _readable(size: int) -> str:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn a full disk or a refused write inside this block into a StoreError that says so.
-
-    The zarrs pipeline puts the number of an operating system's error into the text of a RuntimeError.
-    """
+    """Turn a full disk or a refused write inside this block into a StoreError that says so."""
     try:
         yield
-    except (OSError, RuntimeError) as error:
-        told = re.search(r"\(os error (\d+)\)", str(error))
-        code = error.errno if isinstance(error, OSError) else int(told[1]) if told else None
-        if code not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS):
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS):
             raise
         raise StoreError(
             "writing failed",
             str(path),
-            got=os.strerror(code),
+            got=os.strerror(error.errno),
             remedy="Free some space or mend the permissions, then run again: what is done is kept",
         ) from error
 

@@ -19,6 +19,7 @@ from .passes import Passes, save_array
 from .progress import Sink, silent
 from .provenance import stage_key
 from .shards import Payload, Shard, split
+from .stores import load_array
 
 Bools = NDArray[np.bool_]
 
@@ -71,9 +72,9 @@ def sum_image(
         exposure = coverage(movie.shape[1:], shift[used])
         total = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max))
         for part in parts:
-            add_frames(total, np.load(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
+            add_frames(total, load_array(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
             if payloads[part.index]["missing"]:
-                exposure -= np.load(done.path / f"{part.index}-missing.npy")
+                exposure -= load_array(done.path / f"{part.index}-missing.npy")
         image = np.divide(total * movie.gain, exposure, out=np.zeros(total.shape), where=exposure > 0)
         rounding = np.zeros(2) if drift is None else (drift["drift"].to_numpy() - shift)[used].mean(axis=0)
         stage.end(f"mean of {int(used.sum())} frames")

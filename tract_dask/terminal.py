@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from time import monotonic
 from types import TracebackType
 
@@ -12,53 +11,36 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from .meter import StageMeter
 from .progress import Event, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 
 _PLAIN_INTERVAL_S = 10.0
 _ENDS = {
     "done": "done",
     "done_with_bad_frames": "done, with frames that could not be fitted",
+    "stopped": "stopped as asked: the same command without --until goes on from there",
 }
 
 
-@dataclass
-class Line:
-    """What the terminal knows of one stage."""
-
-    stage: str
-    frames: int = 0
-    done_before: int = 0
-    frame_bytes: int = 0
-    columns: int = 0
-    passes: int = 1
-    done: int = 0
-    fits: int = 0
-    began: float = field(default_factory=monotonic)
-    seconds: float | None = None
-    reused: bool = False
-    summary: str = ""
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the stage began, or that it took."""
-        return self.seconds if self.seconds is not None else monotonic() - self.began
+class Line(StageMeter):
+    """What the terminal says of one stage."""
 
     @property
     def count(self) -> str:
         """How many frames are done, of how many."""
-        return f"{self.done // self.passes}/{self.frames // self.passes} frames" if self.frames else ""
+        return f"{self.done_frames}/{self.movie_frames} frames" if self.frames else ""
 
     @property
-    def rates(self) -> str:
+    def speed(self) -> str:
         """Frames, and fits or megabytes, a second; empty before the first shard."""
-        frames = (self.done - self.done_before) / self.passes
-        if not frames or not self.elapsed:
+        frames, fits = self.rates
+        if not frames:
             return ""
-        parts = [f"{short(frames / self.elapsed)} frames/s"]
-        if self.fits:
-            parts.append(f"{short(self.fits / self.elapsed)} fits/s")
+        parts = [f"{short(frames)} frames/s"]
+        if fits:
+            parts.append(f"{short(fits)} fits/s")
         elif self.frame_bytes:
-            parts.append(f"{size(frames * self.frame_bytes / self.elapsed)}/s")
+            parts.append(f"{size(frames * self.frame_bytes)}/s")
         return "  ".join(parts)
 
     @property
@@ -66,8 +48,8 @@ class Line:
         """The time left, or the time taken."""
         if self.seconds is not None:
             return "as before" if self.reused else clock(self.seconds)
-        frames = self.done - self.done_before
-        return f"{clock((self.frames - self.done) * self.elapsed / frames)} left" if frames else ""
+        left = self.seconds_left
+        return "" if left is None else f"{clock(left)} left"
 
 
 class Terminal:
@@ -107,28 +89,19 @@ class Terminal:
                 if event.dashboard:
                     self._say(f"dashboard {event.dashboard}", "dim")
             case StageStarted():
-                self.lines[event.stage] = Line(
-                    event.stage,
-                    event.frames,
-                    event.done_frames,
-                    event.frame_bytes,
-                    event.columns,
-                    event.passes,
-                    event.done_frames,
-                )
-                self._plain(self._started(self.lines[event.stage]))
+                self.lines[event.stage] = line = Line.start(event)
+                self._plain(self._started(line))
             case ShardDone():
                 line = self.lines.setdefault(event.stage, Line(event.stage))
-                line.done += event.frames
-                line.fits += event.fits
+                line.add(event)
                 if monotonic() - self._printed > _PLAIN_INTERVAL_S:
-                    parts = (line.count, line.rates, line.remaining)
+                    parts = (line.count, line.speed, line.remaining)
                     self._plain(f"{line.stage}: " + ", ".join(filter(None, parts)))
             case StageDone():
                 line = self.lines.setdefault(event.stage, Line(event.stage))
-                line.seconds, line.reused, line.summary = event.seconds, event.reused, event.summary
+                line.finish(event)
                 took = "done before" if event.reused else f"done in {clock(event.seconds)}"
-                self._plain(f"{line.stage}: " + ", ".join(filter(None, (took, line.rates, line.summary))))
+                self._plain(f"{line.stage}: " + ", ".join(filter(None, (took, line.speed, line.summary))))
             case Warned():
                 self._say(f"warning: {event.message}", "yellow")
             case RunDone():
@@ -147,7 +120,7 @@ class Terminal:
             total = max(line.frames, 1)
             share = total if finished else line.done
             bar = ProgressBar(total=total, completed=share, width=width, complete_style="cyan", finished_style="green")
-            note = "  ".join(filter(None, (line.rates, line.summary)))
+            note = "  ".join(filter(None, (line.speed, line.summary)))
             grid.add_row(
                 Text("✓" if finished else "·", style="green" if finished else "cyan"),
                 Text(line.stage, style=dim or "bold"),
@@ -160,7 +133,7 @@ class Terminal:
 
     def _started(self, line: Line) -> str:
         parts = [
-            f"{line.frames // line.passes} frames" if line.frames else "",
+            f"{line.movie_frames} frames" if line.frames else "",
             f"{line.columns} columns" if line.columns else "",
             f"{line.done_before // line.passes} frames done before" if line.done_before else "",
         ]

@@ -17,8 +17,7 @@ from ..results import accepted
 from ..schema import AMPLITUDE, SIGMA_A, SIGMA_B
 from ..settings import FitSettings
 from ..vacuum import check_box, find_vacuum
-from .motion import named, pixel_size_pm
-from .precision import dose_of
+from .motion import dose_of, named, pixel_size_pm, standard_deviation
 
 UNIT = "vacuum A^2"
 """Unit of normalised intensities: that of 1 square angstrom of vacuum."""
@@ -95,7 +94,7 @@ def repeated_error(tracks: xr.Dataset) -> xr.Dataset:
     intensity = tracks["intensity"]
     unit = str(intensity.attrs.get("units", "counts"))
     n = intensity.notnull().sum("frame")
-    sd = intensity.std("frame", ddof=1)
+    sd = standard_deviation(intensity)
     found = {
         "mean": (intensity.mean("frame"), "Mean intensity"),
         "sd": (sd, "Standard deviation of the intensity over the frames"),

@@ -20,16 +20,28 @@ def pixel_size_pm(tracks: xr.Dataset) -> float:
     SettingsError
         Where the tracks do not know it.
     """
-    size = tracks.attrs.get("pixel_size_pm")
-    if not size:
-        raise SettingsError(
-            "the size of a pixel is not known",
-            "tracks.attrs['pixel_size_pm']",
-            "picometres for one pixel",
-            repr(size),
-            "Run again with --pixel-size-pm, or say tracks.assign_attrs(pixel_size_pm=4.0)",
-        )
-    return float(size)
+    again = "Run again with --pixel-size-pm, or say tracks.assign_attrs(pixel_size_pm=4.0)"
+    return _calibrated(tracks, "pixel_size_pm", "the size of a pixel is not known", "picometres for one pixel", again)
+
+
+def dose_of(tracks: xr.Dataset) -> float:
+    """Return the dose of a frame, e/Å^2.
+
+    Raises
+    ------
+    SettingsError
+        Where the tracks do not know it.
+    """
+    again = "Run again with --dose, or give the dose here"
+    return _calibrated(tracks, "dose", "the dose of a frame is not known", "electrons for one square angstrom", again)
+
+
+def _calibrated(tracks: xr.Dataset, name: str, problem: str, expected: str, remedy: str) -> float:
+    """Return a calibration of the movie that the tracks carry as an attribute."""
+    value = tracks.attrs.get(name)
+    if not value:
+        raise SettingsError(problem, f"tracks.attrs[{name!r}]", expected, repr(value), remedy)
+    return float(value)
 
 
 def positions(tracks: xr.Dataset) -> xr.DataArray:
@@ -94,7 +106,7 @@ def spread(tracks: xr.Dataset) -> xr.Dataset:
     ``sd`` = σ, ``sd_radial`` = √2 σ and ``mean_displacement`` = √(π/2) σ.
     """
     place = positions(tracks)
-    deviation = place.std("frame", ddof=1)
+    deviation = standard_deviation(place)
     sd_y, sd_x = (deviation.sel(axis=axis, drop=True) for axis in schema.AXES)
     radial = _length(deviation)
     away = _length(place - reference_positions(tracks)).mean("frame")
@@ -156,6 +168,18 @@ def displacement(tracks: xr.Dataset, first: int, second: int) -> xr.Dataset:
         },
         attrs={"first": first, "second": second},
     )
+
+
+def standard_deviation(values: xr.DataArray) -> xr.DataArray:
+    """Return the standard deviation of a sample over its frames; NaN where there are fewer than two values.
+
+    Unlike Dask's, it does not warn of columns without values. Squares are of the distances to the first frame, which
+    keeps their digits.
+    """
+    away = values - values.isel(frame=0, drop=True).fillna(0)
+    n, total, squares = away.count("frame"), away.sum("frame"), (away**2).sum("frame")
+    variance = (squares - total**2 / n.where(n > 0)) / (n - 1).where(n > 1)
+    return variance.clip(0) ** 0.5
 
 
 def named(values: xr.DataArray, unit: str, description: str) -> xr.DataArray:

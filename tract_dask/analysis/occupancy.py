@@ -20,7 +20,7 @@ from ..settings import FitSettings
 from .intensity import UNIT, normalised
 from .likelihood import CONFIDENCE, Levels, credible_sets, probabilities
 from .lookup import intensity_bound, look_up_table, read_table, write_table
-from .motion import pixel_size_pm
+from .motion import pixel_size_pm, standard_deviation
 
 __all__ = ["count_atoms", "dose_to_be_sure", "look_up_table", "read_table", "write_table"]
 
@@ -285,7 +285,7 @@ def _sigma(measured: xr.Dataset, error: str) -> xr.DataArray:
     """Return the error of each accepted intensity; NaN elsewhere."""
     intensity = measured["intensity"]
     if error == "repeated":
-        return intensity.std("frame", ddof=1) * xr.ones_like(intensity).where(intensity.notnull())
+        return standard_deviation(intensity) * xr.ones_like(intensity).where(intensity.notnull())
     return measured[_ERRORS[error]]
 
 

@@ -15,7 +15,7 @@ from ..kernels.gaussian import blurred
 from ..kernels.information import column_bounds
 from ..results import fitted_with
 from ..schema import SIGMA_A, SIGMA_B, X, Y
-from .motion import named, pixel_size_pm, positions, spread, standard_errors
+from .motion import dose_of, named, pixel_size_pm, positions, spread, standard_deviation, standard_errors
 
 _WIDEST_GAP = np.deg2rad(100)
 """Directions to the neighbours of a column inside a crystal are nowhere farther apart than this."""
@@ -114,8 +114,8 @@ def column_precision(tracks: xr.Dataset, dose: float | None = None) -> xr.Datase
     if "centroid" in tracks:
         fitted = positions(tracks)
         centroids = tracks["centroid"] * pixel_size_pm(tracks)
-        compared["centroid"] = _per_axis(centroids.where(fitted.notnull()).std("frame", ddof=1))
-        compared["centroid_all"] = _per_axis(centroids.std("frame", ddof=1))
+        compared["centroid"] = _per_axis(standard_deviation(centroids.where(fitted.notnull())))
+        compared["centroid_all"] = _per_axis(standard_deviation(centroids))
     found = xr.Dataset({name: named(values, "pm", _COMPARED[name]) for name, values in compared.items()})
     stderr = 1 / (1 / standard_errors(tracks)).mean("frame")
     found["stderr"] = named(_per_axis(stderr), "pm", "Standard error per axis that the fits state")
@@ -195,26 +195,6 @@ def cramer_rao(tracks: xr.Dataset) -> xr.DataArray:
     fixed = fitted_with(tracks, "shape") == "fixed"
     bounds = column_bounds(column, window, radius_px=window / 2, fixed_shape=fixed)
     return _of_columns(tracks, np.sqrt((bounds.x + bounds.y) / 2) * pixel_size_pm(tracks), _COMPARED["crlb"])
-
-
-def dose_of(tracks: xr.Dataset) -> float:
-    """Return the dose of a frame, e/Å^2.
-
-    Raises
-    ------
-    SettingsError
-        Where the tracks do not know it.
-    """
-    dose = tracks.attrs.get("dose")
-    if not dose:
-        raise SettingsError(
-            "the dose of a frame is not known",
-            "tracks.attrs['dose']",
-            "electrons for one square angstrom",
-            repr(dose),
-            "Run again with --dose, or give the dose here",
-        )
-    return float(dose)
 
 
 def _columns_as_they_are(tracks: xr.Dataset) -> NDArray[np.float64]:

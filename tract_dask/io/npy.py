@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings import SourceSettings
+from ..stores import load_array, sole_parser
 from .blocks import open_block
 from .source import Frames, Source, SourceMetadata, checked_dtype, checked_shape
 
@@ -20,7 +21,7 @@ class FortranSource(Source):
 
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
-        frames = np.load(self.files[0], mmap_mode="r").reshape(self.shape)[start:stop]
+        frames = load_array(self.files[0], mmap_mode="r").reshape(self.shape)[start:stop]
         return np.array(frames, dtype=self.dtype, order="C")
 
 
@@ -33,7 +34,7 @@ def open_npy(path: Path, inner: str, settings: SourceSettings) -> Source:
         Where the header is damaged, the file too short, or the array not a movie of numbers.
     """
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, sole_parser():
             version = np.lib.format.read_magic(file)
             header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, fortran, stored = header(file)

@@ -131,12 +131,13 @@ def _find(
     ramp = np.arange(LANES).astype(np.float32)
     for k in range(n):
         start = places[k, 0], places[k, 1]
-        places[k] = np.nan
+        places[k, 0], places[k, 1] = np.nan, np.nan
         status[k] = NOT_FINITE
         if math.isfinite(start[0]) and math.isfinite(start[1]):
             source, first = flat, k * pixels
             if k == n - 1:
-                end[:pixels] = flat[first:]
+                for i in range(pixels):  # an assignment to a slice would more than double the time to compile
+                    end[i] = flat[first + i]
                 source, first = end, 0
             level = source[first + (height // 2) * width + width // 2]
             window = source, first, (height, width), level if math.isfinite(level) else np.float32(0)

@@ -176,12 +176,25 @@ def clean_image(raw: NDArray[Any]) -> tuple[Image, bool]:
             odd[x] += value - value  # NaN from where a value is not finite
             low[x] = min(low[x], value)
             high[x] = max(high[x], value)
-    if odd.sum() == 0.0:
-        return image, low.min() < high.max()
-    finite = np.isfinite(image)
-    values = image.ravel()[finite.ravel()]
-    mean = np.float32(values.sum() / max(1, values.size))
-    return np.where(finite, image, mean), values.size > 0 and values.min() < values.max()
+    least, largest, strange = np.float32(np.inf), np.float32(-np.inf), np.float32(0)
+    for x in range(nx):  # loops: what they replace of numpy takes Numba four times as long to compile
+        least, largest, strange = min(least, low[x]), max(largest, high[x]), strange + odd[x]
+    if strange == 0:
+        return image, bool(least < largest)
+    n, total = 0, 0.0
+    least, largest = np.float32(np.inf), np.float32(-np.inf)
+    for y in range(ny):
+        for x in range(nx):
+            value = image[y, x]
+            if value - value == 0:
+                n, total = n + 1, total + value
+                least, largest = min(least, value), max(largest, value)
+    mean = np.float32(total / max(1, n))
+    for y in range(ny):
+        for x in range(nx):
+            if image[y, x] - image[y, x] != 0:
+                image[y, x] = mean
+    return image, bool(least < largest)
 
 
 @njit(cache=True, nogil=True)

@@ -22,7 +22,7 @@ from .. import plots, stores
 from ..analysis.jumps import change_points
 from ..errors import TractError
 from ..provenance import stage_key
-from ..settings import RunSettings
+from ..settings import RunSettings, Settings
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import figure_data, windows_data
@@ -326,6 +326,8 @@ def settings_rows(settings: RunSettings | None) -> dict[str, list[dict[str, Any]
         values, rows = getattr(settings, group.name), []
         for item in dataclasses.fields(values):
             value = getattr(values, item.name)
+            if isinstance(value, Settings):
+                continue
             rows.append(
                 {
                     "name": f"{group.name}.{item.name}",

@@ -1,0 +1,59 @@
+"""Answers that the workshop makes, and that browsers may keep: with an ETag, by what they are made from."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import Query, Request, Response
+
+Version = Annotated[
+    str,
+    Query(
+        alias="v",
+        max_length=64,
+        pattern="^[0-9a-f]*$",
+        description="The ``version`` that another answer gave: then this one is kept without asking again.",
+    ),
+]
+
+NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "As the client has it (If-None-Match)."}}
+
+_FOREVER = "private, max-age=31536000, immutable"
+_ASK = "private, no-cache"
+
+
+def stamp(*paths: Path) -> str:
+    """Return a text that is another once one of the files has changed, has come or has gone; a folder's files count."""
+    digest = hashlib.sha256()
+    for path in paths:
+        files = sorted(path.glob("*.jsonl")) if path.suffix == ".journal" else [path]
+        for file in files:
+            try:
+                status = file.stat()
+                digest.update(f"{file}\0{status.st_ino}\0{status.st_mtime_ns}\0{status.st_size}\0".encode())
+            except OSError:
+                digest.update(f"{file}\0-\0".encode())
+    return digest.hexdigest()[:16]
+
+
+async def kept_answer(
+    request: Request, media_type: str, version: str, function: Callable[..., bytes], *args: Any, said: str = ""
+) -> Response:
+    """Return what ``function`` makes of ``args`` in the workshop, or 304 where the client has it.
+
+    Parameters
+    ----------
+    version
+        From :func:`stamp`: of all that the function reads.
+    said
+        The version that the client named in its request.
+    """
+    key = hashlib.sha256(f"{version}\0{function.__qualname__}\0{args!r}".encode()).hexdigest()[:32]
+    headers = {"ETag": f'"{key}"', "Cache-Control": _FOREVER if said == version else _ASK}
+    if key in request.headers.get("if-none-match", ""):
+        return Response(status_code=304, headers=headers)
+    content = await request.app.state.workshop.run_kept(key, function, *args)
+    return Response(content, media_type=media_type, headers=headers)

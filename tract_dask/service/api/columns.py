@@ -1,0 +1,346 @@
+"""Columns of a job: read, refined, edited, saved in versions.
+
+Version 0 are the columns that the job's settings find; nothing that was saved is ever changed or overwritten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Path, Request, Response
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+
+from ...errors import MissingStoreError
+from ...settings import RunSettings, from_dict
+from ..data import curation
+from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, MOST_SITES, Scene
+from ..entrance.access import Identity, Role, identity, may_change
+from ..jobs.states import CURATABLE, State
+from ..jobs.store import Job, JobStore
+from ..planning import inside
+from .models import JobId, JobRecord, Text, errors
+from .previews import folder_of
+
+router = APIRouter(tags=["columns"])
+
+_FAR = 1e6
+_Px = Annotated[float, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
+_Place = Annotated[
+    tuple[_Px, _Px], Field(description="x, y in px of the summed image; an integer is a pixel's centre.")
+]
+_Kind = Annotated[Text, Field(max_length=LONGEST_KIND, description="Sublattice or element, free text.")]
+_Count = Annotated[int, Field(ge=1, le=100_000)]
+_Spacing = Annotated[float, Field(ge=2, le=_FAR, allow_inf_nan=False)]
+
+
+class EditedColumn(BaseModel):
+    """A column as a user has it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    column_id: int | None = Field(None, ge=0, lt=HIGHEST_ID, description="Null: a new one, which gets a new number.")
+    x: _Px = Field(description="Column of the image, px.")
+    y: _Px = Field(description="Row of the image, px.")
+    kind: _Kind = ""
+
+
+_Columns = Annotated[list[EditedColumn], Field(min_length=1, max_length=MOST_COLUMNS)]
+
+
+class FoundColumn(BaseModel):
+    """A column, with what its fit in the summed image found; null where there is none."""
+
+    column_id: int
+    x: float
+    y: float
+    kind: str
+    flags: list[str] = Field(description="What speaks against its fit: below_noise, outside_frame and so on.")
+    amplitude: float | None = Field(description="Counts a frame.")
+    sigma_a: float | None = Field(description="px")
+    sigma_b: float | None = Field(description="px")
+
+
+_EXAMPLE_COLUMN: dict[str, Any] = {"column_id": 7, "x": 120.31, "y": 88.02, "kind": "Ce"}
+_EXAMPLE_FOUND: dict[str, Any] = _EXAMPLE_COLUMN | {"flags": [], "amplitude": 3.1, "sigma_a": 7.4, "sigma_b": 6.9}
+_EXAMPLE_VERSION: dict[str, Any] = {
+    "version": 1,
+    "time": "2026-11-22T10:05:00.000Z",
+    "author": "maria",
+    "note": "from version 0: two at the edge removed",
+    "count": 132,
+}
+
+
+class VersionRecord(BaseModel):
+    """A version of a job's columns."""
+
+    version: int = Field(description="0: those found automatically.")
+    time: str = Field(description="UTC, ISO 8601.")
+    author: str
+    note: str
+    count: int = Field(description="Columns.")
+
+
+class Versions(BaseModel):
+    """The versions of a job's columns, oldest first."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "versions": [_EXAMPLE_VERSION],
+                "next_column_id": 134,
+                "chosen": None,
+                "state": "waiting_for_columns",
+                "may_save": True,
+                "may_continue": True,
+            }
+        }
+    )
+
+    versions: list[VersionRecord]
+    next_column_id: int = Field(description="No version has a column of this number, or of a higher one.")
+    chosen: int | None = Field(description="The version that is, or was, fitted; null: nobody has chosen one.")
+    state: State = Field(description="Of the job.")
+    may_save: bool = Field(description="Whether you may save a version.")
+    may_continue: bool = Field(description="Whether you may let the job go on with a version.")
+
+
+class Table(BaseModel):
+    """A version of a job's columns."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"version": 0, "columns": [_EXAMPLE_FOUND], "spacing_px": 82.8}}
+    )
+
+    version: int
+    columns: list[FoundColumn]
+    spacing_px: float | None = Field(description="Median distance to the nearest neighbour.")
+
+
+class NewVersion(BaseModel):
+    """Columns to be kept as a version."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"example": {"columns": [_EXAMPLE_COLUMN], "note": "two at the edge removed", "base": 0}},
+    )
+
+    columns: _Columns
+    note: Annotated[Text, Field(max_length=500)] = ""
+    base: int | None = Field(None, ge=0, lt=HIGHEST_ID, description="The version that these were made from.")
+
+
+class Saved(BaseModel):
+    """What was saved."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"version": 2, "count": 131, "newer": [1]}})
+
+    version: int
+    count: int
+    newer: list[int] = Field(description="Versions that were saved after the one that these columns were made from.")
+
+
+class ToRefine(BaseModel):
+    """Columns to be fitted in the summed image."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"example": {"columns": [_EXAMPLE_COLUMN], "spacing_px": 82.8}}
+    )
+
+    columns: _Columns
+    spacing_px: _Spacing | None = Field(
+        None, description="For some of the columns only: the distance between neighbours among all of them."
+    )
+
+
+class Refined(BaseModel):
+    """Where columns are in the summed image."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {"columns": [_EXAMPLE_FOUND], "merged": [[7, 12]], "spacing_px": 82.8, "window_px": 41}
+        }
+    )
+
+    columns: list[FoundColumn]
+    merged: list[tuple[int, int]] = Field(description="A column, and one left out because it fell together with it.")
+    spacing_px: float
+    window_px: int
+
+
+class Lattice(BaseModel):
+    """A lattice that three atoms define."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "origin": [10, 10],
+                "a": [90, 10],
+                "a_count": 4,
+                "b": [10, 70],
+                "b_count": 3,
+                "a_repeats": 12,
+                "b_repeats": 9,
+                "kind": "Ce",
+                "beside": [[10.2, 10.1]],
+            }
+        },
+    )
+
+    origin: _Place
+    a: _Place
+    a_count: _Count = Field(description="Columns from the origin to the a-atom, the origin not counted.")
+    b: _Place
+    b_count: _Count = Field(description="Columns from the origin to the b-atom, the origin not counted.")
+    a_repeats: _Count = Field(1, description=f"Columns along a, the origin counted; in all at most {MOST_SITES}.")
+    b_repeats: _Count = Field(1, description="Columns along b.")
+    kind: _Kind = ""
+    beside: Annotated[list[_Place], Field(max_length=MOST_COLUMNS)] = Field(
+        default_factory=list, description="Columns that are there: a site within a third of the spacing is one of them."
+    )
+
+
+class Sites(BaseModel):
+    """The sites of a lattice in the image."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {"columns": [_EXAMPLE_FOUND], "outside": 3, "merged": 1, "spacing_px": 20.0},
+        }
+    )
+
+    columns: list[FoundColumn]
+    outside: int = Field(description="Sites left out because they are outside of the image.")
+    merged: int = Field(description="Sites left out because there is a column already.")
+    spacing_px: float
+
+
+class Choice(BaseModel):
+    """The version of the columns that is to be fitted."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"version": 1}})
+
+    version: int = Field(ge=0, lt=HIGHEST_ID, description="0: the columns found automatically.")
+
+
+def _answers(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
+    """Return the declaration of a route whose answer the workshop makes."""
+    return {200: {"model": model}} | errors(400, 404, 503)
+
+
+Who = Annotated[Identity, Depends(identity)]
+VersionNumber = Annotated[int, Path(ge=0, lt=HIGHEST_ID, description="0: the columns found automatically.")]
+
+
+def scene_of_job(job_id: JobId, request: Request) -> Scene:
+    """Return the image on which the columns of a job are edited."""
+    job: Job = request.app.state.store.job(job_id)
+    settings = inside(request.app.state.root, from_dict(RunSettings, job.settings))
+    return curation.scene_of(folder_of(request, job_id), settings)
+
+
+OfJob = Annotated[Scene, Depends(scene_of_job)]
+
+
+@router.get("/jobs/{job_id}/columns", response_model=Versions, responses=errors(400, 404, 503))
+async def list_versions(job_id: JobId, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
+    """List the versions of a job's columns."""
+    first = await request.app.state.workshop.run(curation.summary, scene)
+    return await run_in_threadpool(_versions, request.app.state.store, job_id, first, who)
+
+
+@router.get("/jobs/{job_id}/columns/{version}", responses=_answers(Table))
+async def read_version(job_id: JobId, version: VersionNumber, request: Request, scene: OfJob) -> Response:
+    """Read a version of a job's columns."""
+    store: JobStore = request.app.state.store
+    table = await run_in_threadpool(store.columns, job_id, version) if version else None
+    return _json(await request.app.state.workshop.run(curation.version_json, scene, version, table))
+
+
+@router.post("/jobs/{job_id}/columns", status_code=201, response_model=Saved, responses=errors(400, 404, 503))
+async def save_version(job_id: JobId, new: NewVersion, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
+    """Keep columns as a new version of a job's."""
+    store, workshop = request.app.state.store, request.app.state.workshop
+    await run_in_threadpool(lambda: may_change(who, store.job(job_id)))
+    first = await workshop.run(curation.summary, scene)
+    known = await run_in_threadpool(_versions, store, job_id, first, who)
+    table = await workshop.run(curation.checked_csv, scene, *_parts(new.columns), known["next_column_id"])
+    note = new.note.strip()
+    if new.base is not None:
+        note = f"from version {new.base}: {note}" if note else f"from version {new.base}"
+    version = await run_in_threadpool(store.add_columns, job_id, table, who.name, note)
+    base = version if new.base is None else new.base
+    newer = [one["version"] for one in known["versions"] if one["version"] > base]
+    return {"version": version, "count": len(new.columns), "newer": newer}
+
+
+@router.post("/jobs/{job_id}/columns/refine", responses=_answers(Refined))
+async def refine_columns(job_id: JobId, given: ToRefine, request: Request, scene: OfJob) -> Response:
+    """Fit columns in the summed image, as a run that is given them does; nothing is kept."""
+    work = request.app.state.workshop.run(curation.refined_json, scene, *_parts(given.columns), given.spacing_px)
+    return _json(await work)
+
+
+@router.post("/jobs/{job_id}/columns/lattice", responses=_answers(Sites))
+async def lattice_columns(job_id: JobId, lattice: Lattice, request: Request, scene: OfJob) -> Response:
+    """Make the sites of a lattice inside the summed image; nothing is kept."""
+    how = lattice.model_dump(exclude={"beside"})
+    return _json(await request.app.state.workshop.run(curation.lattice_json, scene, how, np.array(lattice.beside)))
+
+
+@router.post("/jobs/{job_id}/continue", response_model=JobRecord, responses=errors(400, 404, 409))
+def continue_job(job_id: JobId, choice: Choice, request: Request, scene: OfJob, who: Who) -> Job:
+    """Let a job that waits for columns, or has ended, fit a version of them."""
+    state = request.app.state
+    may_change(who, state.store.job(job_id))
+    if not scene.exists:
+        raise MissingStoreError(
+            "there are no columns yet", job_id, remedy="Wait until the job has found them, or try it again"
+        )
+    job: Job = state.store.go_on(job_id, choice.version)
+    state.runner.wake()
+    return job
+
+
+def _versions(store: JobStore, job_id: str, first: dict[str, Any], who: Identity) -> dict[str, Any]:
+    job, saved = store.job(job_id), store.columns_versions(job_id)
+    found = {
+        "version": 0,
+        "time": first["created"],
+        "author": "automatic",
+        "note": "as the settings find them",
+        "count": first["count"],
+    }
+    highest = [first["highest_id"], *(_highest_id(store, job_id, one["version"]) for one in saved)]
+    own = who.role == Role.ADMIN or who.name == job.owner
+    return {
+        "versions": [found, *saved],
+        "next_column_id": max(highest) + 1,
+        "chosen": job.columns_version,
+        "state": job.state,
+        "may_save": own,
+        "may_continue": own and job.state in CURATABLE,
+    }
+
+
+@lru_cache(maxsize=4096)
+def _highest_id(store: JobStore, job_id: str, version: int) -> int:
+    """Return the highest number of a version's columns; versions never change."""
+    lines = store.columns(job_id, version).splitlines()[1:]
+    return max(int(line.partition(",")[0]) for line in lines)
+
+
+def _parts(columns: Sequence[EditedColumn]) -> tuple[NDArray[np.float64], list[str], list[int | None]]:
+    """Return places (columns, 2), kinds and numbers: what is sent to the workshop."""
+    places = np.array([(column.x, column.y) for column in columns])
+    return places, [column.kind for column in columns], [column.column_id for column in columns]
+
+
+def _json(content: bytes) -> Response:
+    return Response(content, media_type="application/json")

@@ -1,0 +1,112 @@
+"""What lies under the data root."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
+
+from ..folders import Entry
+from ..planning import about_movie
+from .models import RelativePath, errors
+
+router = APIRouter(tags=["files"])
+
+
+class EntryRecord(BaseModel):
+    """A line of a folder's listing."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    name: str
+    path: str = Field(description='Relative to the data root, with "/" between.')
+    kind: str = Field(description="folder, movie, or file for what is neither.")
+    bytes: int | None = Field(description="Size of a file; null for folders and stores.")
+    modified: str = Field(description="UTC, ISO 8601.")
+
+
+class Listing(BaseModel):
+    """A folder."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "path": "2026-11",
+                "entries": [
+                    {
+                        "name": "ceo2_surface.tif",
+                        "path": "2026-11/ceo2_surface.tif",
+                        "kind": "movie",
+                        "bytes": 1073742336,
+                        "modified": "2026-11-21T09:12:44Z",
+                    }
+                ],
+            }
+        }
+    )
+
+    path: str
+    entries: list[EntryRecord]
+
+
+class About(BaseModel):
+    """What a movie says about itself."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "path": "2026-11/ceo2_surface.tif",
+                "format": "TIFF",
+                "files": 1,
+                "shape": [2048, 1024, 1024],
+                "dtype": "uint8",
+                "bytes": 2147483648,
+                "pixel_size_pm": 8.0,
+                "frame_time_s": 0.025,
+                "dose": None,
+                "gain": 1.0,
+                "warnings": [],
+            }
+        }
+    )
+
+    path: str
+    format: str
+    files: int = Field(description="How many files hold the frames.")
+    shape: tuple[int, int, int] = Field(description="Frames, rows and columns.")
+    dtype: str
+    bytes: int = Field(description="Of all frames, uncompressed.")
+    pixel_size_pm: float | None = Field(description="Side of a pixel in pm; null: the file does not say.")
+    frame_time_s: float | None = Field(description="From one frame to the next, in s.")
+    dose: float | None = Field(description="Of a frame, in e/A^2.")
+    gain: float = Field(description="Electron counts for one detector unit.")
+    warnings: list[str] = Field(description="What the user should read.")
+
+
+FolderPath = Annotated[RelativePath, Query(description="A folder under the data root; empty: the root itself.")]
+MoviePath = Annotated[RelativePath, Query(min_length=1, description="A movie under the data root.")]
+
+
+@router.get("/files", response_model=Listing, responses=errors(404))
+def list_files(request: Request, path: FolderPath = "") -> dict[str, Any]:
+    """List a folder: folders first, then movies and other files, by name; hidden ones are left out."""
+    entries: list[Entry] = request.app.state.root.listing(path)
+    return {"path": path, "entries": entries}
+
+
+@router.get("/files/about", response_model=About, responses=errors(400, 404, 503))
+async def about_file(
+    request: Request,
+    path: MoviePath,
+    raw_shape: Annotated[
+        list[int] | None, Query(description="Of a raw file: frames, rows, columns.", min_length=3, max_length=3)
+    ] = None,
+    raw_dtype: Annotated[RelativePath | None, Query(description="Of a raw file, such as uint16.")] = None,
+    raw_offset: Annotated[int, Query(ge=0, le=2**53, description="Of a raw file: bytes to skip.")] = 0,
+) -> dict[str, Any]:
+    """Read what a movie says about itself, without its pixels."""
+    state = request.app.state
+    declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
+    found: dict[str, Any] = await state.workshop.run(about_movie, state.root.source(path), declared)
+    return found | {"path": path}

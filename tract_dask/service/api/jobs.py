@@ -1,0 +1,124 @@
+"""Jobs: submit, list, read, cancel, retry, label, delete."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+
+from ..entrance.access import Identity, identity, may_change
+from ..jobs.states import State
+from ..jobs.store import Job, JobStore
+from ..planning import check_job
+from ..tidying import delete_folder
+from .models import After, Deleted, JobDetail, JobId, JobList, JobRecord, Label, Log, LogLine, NewJob, NewLabel, errors
+
+router = APIRouter(tags=["jobs"])
+
+Who = Annotated[Identity, Depends(identity)]
+
+_LINKS = ("events", "log", "columns", "sum", "results", "report")
+
+
+@router.post("/jobs", status_code=201, response_model=JobRecord, responses=errors(400, 404, 409, 503))
+async def submit_job(new: NewJob, request: Request, response: Response, who: Who) -> Job:
+    """Queue a job, after the checks that a run makes before it starts: the movie opens, and the settings fit it."""
+    state = request.app.state
+    settings, output, _ = await check_job(state, new.source, new.settings, new.output)
+    job: Job = state.store.submit(
+        source=new.source, settings=settings, owner=who.name, label=new.label, output=output, curate=new.curate
+    )
+    state.runner.wake()
+    response.headers["Location"] = str(request.url_for("read_job", job_id=job.id).path)
+    return job
+
+
+@router.get("/jobs", response_model=JobList, responses=errors())
+def list_jobs(
+    request: Request,
+    state: Annotated[list[State], Query(description="Only jobs in one of these states.", max_length=10)] = [],  # noqa: B006
+    owner: Annotated[Label, Query(description="Only this owner's jobs.")] = "",
+    text: Annotated[Label, Query(description="Only jobs with this in label, source, owner or id.")] = "",
+    before: Annotated[int | None, Query(ge=0, le=2**53, description="Only jobs with smaller numbers.")] = None,
+    limit: Annotated[int, Query(ge=1, le=500, description="Jobs of a page.")] = 50,
+) -> dict[str, Any]:
+    """List jobs, the newest first."""
+    store: JobStore = request.app.state.store
+    event = store.newest_event()  # first: what happens meanwhile comes as an event, too
+    found = store.jobs(states=state, owner=owner, text=text, before=before, limit=limit + 1)
+    return {
+        "jobs": found[:limit],
+        "counts": store.counts(owner=owner, text=text),
+        "next": found[limit - 1].number if len(found) > limit else None,
+        "event": event,
+    }
+
+
+@router.get("/jobs/{job_id}", response_model=JobDetail, responses=errors(404))
+def read_job(job_id: JobId, request: Request) -> dict[str, Any]:
+    """Read a job, its history, and where to find the rest of it."""
+    store: JobStore = request.app.state.store
+    event = store.newest_event()
+    job = store.job(job_id)
+    place = request.url_for("read_job", job_id=job_id).path
+    links = {"self": place} | {name: f"{place}/{name}" for name in _LINKS}
+    return job.to_record() | {"transitions": store.transitions(job_id), "links": links, "event": event}
+
+
+@router.post("/jobs/{job_id}/cancel", response_model=JobRecord, responses=errors(404, 409))
+def cancel_job(job_id: JobId, request: Request, who: Who) -> Job:
+    """Cancel a job: at once, or as soon as its process has ended; what is done is kept, and can be gone on from."""
+    state = request.app.state
+    may_change(who, state.store.job(job_id))
+    job: Job = state.store.request_cancel(job_id, f"cancelled by {who.name}")
+    state.runner.wake()
+    return job
+
+
+@router.post("/jobs/{job_id}/retry", response_model=JobRecord, responses=errors(404, 409))
+def retry_job(job_id: JobId, request: Request, who: Who) -> Job:
+    """Queue a job again that failed, was cancelled, or could not fit some frames; it goes on from what is done."""
+    state = request.app.state
+    may_change(who, state.store.job(job_id))
+    job: Job = state.store.retry(job_id)
+    state.runner.wake()
+    return job
+
+
+@router.post("/jobs/{job_id}/label", response_model=JobRecord, responses=errors(400, 404))
+def label_job(job_id: JobId, new: NewLabel, request: Request, who: Who) -> Job:
+    """Give a job another label."""
+    store: JobStore = request.app.state.store
+    may_change(who, store.job(job_id))
+    return store.label(job_id, new.label)
+
+
+@router.delete("/jobs/{job_id}", response_model=Deleted, responses=errors(404, 409))
+def delete_job(
+    job_id: JobId,
+    request: Request,
+    who: Who,
+    files: Annotated[
+        bool, Query(description="Delete what it wrote, too: only files of a run, and only its own.")
+    ] = False,
+) -> Deleted:
+    """Delete a job that has ended, or waits; its files stay where they are, unless they are to go with it."""
+    state = request.app.state
+    job = state.store.job(job_id)
+    may_change(who, job)
+    state.store.delete(job_id)
+    kept = delete_folder(state.root, state.store, job) if files else ""
+    return Deleted(id=job_id, files=files and not kept, kept=kept)
+
+
+@router.get("/jobs/{job_id}/log", response_model=Log, responses=errors(404))
+def read_log(
+    job_id: JobId,
+    request: Request,
+    after: After = 0,
+    limit: Annotated[int, Query(ge=1, le=2000, description="Lines of a page.")] = 1000,
+) -> Log:
+    """Read a job's log."""
+    found = request.app.state.store.log_of(job_id, after, limit + 1)
+    lines = [LogLine(id=event.id, time=event.time, **event.data) for event in found[:limit]]
+    return Log(lines=lines, next=lines[-1].id if len(found) > limit else None)

@@ -1,0 +1,308 @@
+"""What goes over the wire: the requests, the answers, and the errors, each with its limits and an example."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from fastapi import Path, Query
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, WithJsonSchema
+
+from ..jobs.states import State
+from ..problems import ERRORS
+from .declarations import settings_schema
+
+MAX_ITEMS, MAX_DEPTH, MAX_TEXT = 20_000, 6, 4096
+"""Values in the settings of a request, how deep they may be nested, and characters of one text."""
+
+
+def plain_text(text: str) -> str:
+    """Return ``text`` if it can be stored and shown.
+
+    Raises
+    ------
+    ValueError
+        Where it has control characters or halves of characters (lone surrogates).
+    """
+    if any(ord(sign) < 32 or 0x7F <= ord(sign) < 0xA0 or 0xD800 <= ord(sign) < 0xE000 for sign in text):
+        raise ValueError("the text has control characters or halves of characters")
+    return text
+
+
+def plain_values(value: dict[str, Any]) -> dict[str, Any]:
+    """Return ``value`` if it is a bounded tree of plain JSON values.
+
+    Raises
+    ------
+    ValueError
+        Where a number is not finite or a text not plain, or there is too much of anything.
+    """
+    left, level = MAX_ITEMS, [value]
+    for _ in range(MAX_DEPTH):
+        left -= len(level)
+        if left < 0:
+            raise ValueError(f"these are more than {MAX_ITEMS} values")
+        level = [part for item in level for part in _parts(item)]
+    if level:
+        raise ValueError(f"the values are nested more than {MAX_DEPTH} deep")
+    return value
+
+
+def _parts(value: Any) -> list[Any]:
+    """Return what a value consists of; a text, a number or nothing has no parts."""
+    match value:
+        case dict():
+            return [*value, *value.values()]
+        case list():
+            return value
+        case str() if len(value) > MAX_TEXT:
+            raise ValueError(f"a text has more than {MAX_TEXT} characters")
+        case str():
+            plain_text(value)
+        case float() if not math.isfinite(value):
+            raise ValueError("a number is not finite")
+        case int() if abs(value) > 2**53:
+            raise ValueError("a whole number is beyond 2^53")
+    return []
+
+
+Text = Annotated[
+    str, AfterValidator(plain_text), Field(json_schema_extra={"pattern": "^[^\\u0000-\\u001f\\u007f-\\u009f]*$"})
+]
+Label = Annotated[Text, StringConstraints(max_length=200)]
+RelativePath = Annotated[Text, StringConstraints(max_length=1024)]
+SettingValues = Annotated[
+    dict[str, dict[str, Any]],
+    AfterValidator(plain_values),
+    WithJsonSchema(settings_schema()),
+]
+JobId = Annotated[str, Path(pattern="^[0-9a-f]{10}$", description="The job's id.", examples=["3f9a0c12de"])]
+After = Annotated[int, Query(ge=0, le=2**53, description="Only what came after the event of this number.")]
+
+EXAMPLE_JOB: dict[str, Any] = {
+    "id": "3f9a0c12de",
+    "number": 17,
+    "label": "CeO2, 500 e/A^2",
+    "owner": "maria",
+    "source": "2026-11/ceo2_surface.tif",
+    "output": "jobs/3f9a0c12de",
+    "settings": {"metadata": {"pixel_size_pm": 8.0}, "fit": {"window_px": 25}},
+    "curate": False,
+    "state": "running",
+    "reason": "",
+    "stage": "fit",
+    "created": "2026-11-22T10:00:00.000Z",
+    "started": "2026-11-22T10:00:01.250Z",
+    "ended": None,
+    "attempts": 1,
+    "progress": {
+        "stage": "fit",
+        "done_frames": 512,
+        "frames": 2048,
+        "passes": 1,
+        "fits": 61440,
+        "frames_per_s": 210.5,
+        "fits_per_s": 25260.0,
+        "seconds_left": 7.3,
+        "fraction": 0.71,
+        "stages": {
+            "convert": {
+                "state": "done",
+                "seconds": 4.2,
+                "started": "2026-11-22T10:00:01.300Z",
+                "ended": "2026-11-22T10:00:05.500Z",
+                "frames": 2048,
+                "done_frames": 2048,
+                "summary": "",
+            }
+        },
+    },
+    "outcome": {},
+    "columns_version": None,
+    "not_before": None,
+}
+
+
+def errors(*codes: int) -> dict[int | str, dict[str, Any]]:
+    """Return the declaration of the errors that a route can answer: these, and what any request may meet."""
+    return {code: ERRORS[code] for code in sorted({401, 403, 413, 422, 500, *codes})}
+
+
+class StageRecord(BaseModel):
+    """How far a stage of a job is."""
+
+    state: Literal["pending", "running", "done", "reused"]
+    seconds: float | None = Field(None, description="Time that it took, in s.")
+    started: str | None = Field(None, description="UTC, ISO 8601.")
+    ended: str | None = None
+    frames: int = 0
+    done_frames: int = 0
+    summary: str = ""
+
+
+class ProgressRecord(BaseModel):
+    """How far a job is."""
+
+    stage: str = ""
+    done_frames: int = Field(0, description="Frames of the stage that are done; a frame counts once in every pass.")
+    frames: int = 0
+    passes: int = 1
+    fits: int = 0
+    frames_per_s: float | None = None
+    fits_per_s: float | None = None
+    seconds_left: float | None = Field(None, description="Estimated time to the end of the stage, in s.")
+    fraction: float = Field(0.0, description="Of the whole run, 0 to 1.")
+    stages: dict[str, StageRecord] = Field(default_factory=dict)
+
+
+class OutcomeRecord(BaseModel):
+    """What a job measured; nothing of it is set before the end."""
+
+    frames: int | None = None
+    columns: int | None = None
+    fits: int | None = None
+    accepted: int | None = None
+    bad_frames: int | None = None
+    seconds: dict[str, float] | None = Field(None, description="Time of every stage that worked, in s.")
+
+
+class JobRecord(BaseModel):
+    """A job."""
+
+    model_config = ConfigDict(from_attributes=True, json_schema_extra={"example": EXAMPLE_JOB})
+
+    id: str = Field(description="10 hexadecimal digits.")
+    number: int = Field(description="Order of submission.")
+    label: str
+    owner: str
+    source: str = Field(description="The movie, relative to the data root.")
+    output: str = Field(description="The folder of its results, relative to the data root.")
+    settings: dict[str, Any] = Field(description="By group and name; what is not here has its default.")
+    curate: bool = Field(description="Whether it stops after the summed image, for columns to be edited by hand.")
+    state: State
+    reason: str = Field(description="Why it is in this state, where that needs saying.")
+    stage: str
+    created: str = Field(description="UTC, ISO 8601.")
+    started: str | None
+    ended: str | None
+    attempts: int
+    progress: ProgressRecord
+    outcome: OutcomeRecord
+    columns_version: int | None = Field(
+        description="Version of the columns that is fitted; 0: those found automatically; null: nobody has chosen."
+    )
+    not_before: str | None = Field(None, description="When a job whose cluster was lost is tried again.")
+
+
+class Transition(BaseModel):
+    """A change of a job's state or stage."""
+
+    time: str
+    state: State
+    stage: str
+    reason: str
+
+
+class JobDetail(JobRecord):
+    """A job with its history, and where the rest of it is found."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": EXAMPLE_JOB
+            | {
+                "transitions": [
+                    {"time": "2026-11-22T10:00:00.000Z", "state": "queued", "stage": "", "reason": "submitted"}
+                ],
+                "links": {"self": "/api/v1/jobs/3f9a0c12de"},
+                "event": 311,
+            }
+        }
+    )
+
+    transitions: list[Transition]
+    links: dict[str, str]
+    event: int = Field(description="Number of the newest event when this was read: subscribe to what comes after it.")
+
+
+class JobList(BaseModel):
+    """A page of jobs, the newest first."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {"jobs": [EXAMPLE_JOB], "counts": {"queued": 3, "running": 1}, "next": None, "event": 311}
+        }
+    )
+
+    jobs: list[JobRecord]
+    counts: dict[State, int] = Field(description="Jobs by state, of all that owner and text let through.")
+    next: int | None = Field(description="What to give as ``before`` for the next page; null: this is the last.")
+    event: int = Field(description="Number of the newest event when this was read: subscribe to what comes after it.")
+
+
+class NewJob(BaseModel):
+    """A job to be done."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "source": "2026-11/ceo2_surface.tif",
+                "settings": {"metadata": {"pixel_size_pm": 8.0}},
+                "label": "CeO2, 500 e/A^2",
+                "curate": True,
+            }
+        },
+    )
+
+    source: RelativePath = Field(
+        min_length=1, description="The movie: a file, file.h5::/path/in/file, a folder, or a glob, under the data root."
+    )
+    settings: SettingValues = Field(default_factory=dict, description="By group and name; the rest has its default.")
+    label: Label = ""
+    output: RelativePath = Field("", description="A folder under the data root; empty: one of its own below jobs/.")
+    curate: bool = Field(False, description="Stop after the summed image, for columns to be edited by hand.")
+
+
+class NewLabel(BaseModel):
+    """Another label for a job."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"label": "second try"}})
+
+    label: Label
+
+
+class Deleted(BaseModel):
+    """What was deleted."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"id": "3f9a0c12de", "files": False, "kept": ""}})
+
+    id: str
+    files: bool = Field(description="Whether its folder went with it.")
+    kept: str = Field(description="Why the folder was kept although it was to go; empty: it was not to go, or it went.")
+
+
+class LogLine(BaseModel):
+    """A line of a job's log."""
+
+    id: int
+    time: str
+    level: str
+    message: str
+
+
+class Log(BaseModel):
+    """A part of a job's log, in the order of time."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "lines": [
+                    {"id": 12, "time": "2026-11-22T10:00:01.250Z", "level": "info", "message": "convert: 2048 frames"}
+                ],
+                "next": None,
+            }
+        }
+    )
+
+    lines: list[LogLine]
+    next: int | None = Field(description="What to give as ``after`` for what follows; null: there is no more.")

@@ -1,0 +1,213 @@
+"""Frames and summed images as pictures, at any zoom, and what values they have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+
+from ... import stores
+from ...errors import MissingStoreError
+from ...settings import MetadataSettings, SourceSettings, from_dict
+from ..data import pictures
+from ..data.pictures import MAX_SIDE_PX, View
+from .answers import NOT_MODIFIED, Version, kept_answer, stamp
+from .models import JobId, RelativePath, errors
+
+router = APIRouter(tags=["previews"])
+
+_NUMBER = r"-?\d{1,8}(\.\d{1,12})?"
+
+
+class Levels(BaseModel):
+    """What values an image has, as it is seen: zoomed out, noise is less."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "version": "0f3a9c1122334455",
+                "shape": [512, 576],
+                "range": [0.0, 14.2],
+                "percentiles": {"0.5": 0.4, "50.0": 3.1, "99.5": 9.7},
+                "counts": [12, 340, 88],
+                "edges": [0.0, 4.7, 9.5, 14.2],
+                "pixel_size_pm": 7.8,
+            }
+        }
+    )
+
+    version: str = Field(description="Another once the image has changed; give it as ``v`` with its pictures.")
+    shape: tuple[int, int] = Field(description="Rows and columns of the whole image, px.")
+    range: list[float] | None = Field(
+        min_length=2, max_length=2, description="Smallest and largest value, counts; null: nothing exposed."
+    )
+    percentiles: dict[str, float] | None = Field(description="Values, in counts, by percentile.")
+    counts: list[int] = Field(description="Points of the picture in each bin of the histogram.")
+    edges: list[float] = Field(description="Edges of its bins, counts.")
+    pixel_size_pm: float | None = Field(None, description="Size of a pixel, where it is known.")
+
+
+_ERRORS = errors(400, 404, 503) | NOT_MODIFIED
+_LEVELS: dict[int | str, dict[str, Any]] = _ERRORS | {200: {"model": Levels}}
+_PICTURE: dict[int | str, dict[str, Any]] = _ERRORS | {
+    200: {
+        "description": "Grey levels: 0 (transparent) where nothing was exposed, 1 at ``low`` to 255 at ``high``.",
+        "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+def view(
+    box: Annotated[
+        str,
+        Query(
+            pattern=f"^({_NUMBER}(,{_NUMBER}){{3}})?$",
+            description="Edges x0,y0,x1,y1 in px; an integer coordinate is a pixel's centre, so the whole image is "
+            "-0.5,-0.5,width-0.5,height-0.5, which is also meant by nothing.",
+            examples=["-0.5,-0.5,575.5,511.5"],
+        ),
+    ] = "",
+    width: Annotated[int, Query(ge=1, le=MAX_SIDE_PX, description="Of the picture, in its own pixels.")] = 1024,
+    low: Annotated[float | None, Query(ge=-1e30, le=1e30, description="Counts that are black; else automatic.")] = None,
+    high: Annotated[float | None, Query(ge=-1e30, le=1e30, description="Counts that are white.")] = None,
+) -> View:
+    """Return what is to be seen."""
+    x0, y0, x1, y1 = map(float, box.split(",")) if box else (0.0, 0.0, 0.0, 0.0)
+    return View((x0, y0, x1, y1) if box else None, width, low, high)
+
+
+Seen = Annotated[View, Depends(view)]
+FrameNumber = Annotated[int, Query(ge=0, le=2**53, description="Number of the frame, from 0.")]
+
+
+def declared_raw(
+    raw_shape: Annotated[
+        str, Query(pattern=r"^(\d{1,9},\d{1,9},\d{1,9})?$", description="Frames,rows,columns of a raw binary file.")
+    ] = "",
+    raw_dtype: Annotated[str, Query(max_length=16, description="Pixel type of a raw binary file.")] = "",
+    raw_offset: Annotated[int, Query(ge=0, le=2**53, description="Bytes to skip at its start.")] = 0,
+) -> SourceSettings:
+    """Return how a raw file is to be read."""
+    shape = tuple(map(int, raw_shape.split(","))) if raw_shape else None
+    return SourceSettings(shape, raw_dtype or None, raw_offset)
+
+
+def declared_gain(
+    gain: Annotated[float, Query(gt=0, le=1e12, description="Electron counts for one detector unit.")] = 1.0,
+) -> MetadataSettings:
+    """Return what counts are."""
+    return MetadataSettings(gain=gain)
+
+
+MoviePath = Annotated[RelativePath, Query(min_length=1, description="The movie, relative to the data root.")]
+Raw = Annotated[SourceSettings, Depends(declared_raw)]
+Gain = Annotated[MetadataSettings, Depends(declared_gain)]
+
+
+@router.get("/files/frame.png", response_class=Response, responses=_PICTURE)
+async def frame_picture(
+    request: Request, path: MoviePath, seen: Seen, raw: Raw, gain: Gain, frame: FrameNumber = 0, said: Version = ""
+) -> Response:
+    """Show a part of a frame of a movie on disk, in any format, also of a converted one."""
+    place, version = await run_in_threadpool(_movie, request, path)
+    return await kept_answer(
+        request, "image/png", version, pictures.source_png, place, raw, gain, frame, seen, version, said=said
+    )
+
+
+@router.get(
+    "/files/histogram",
+    response_class=Response,
+    responses=_LEVELS,
+)
+async def frame_histogram(
+    request: Request, path: MoviePath, seen: Seen, raw: Raw, gain: Gain, frame: FrameNumber = 0
+) -> Response:
+    """Tell what values a frame has, as frame.png shows it with the same parameters."""
+    place, version = await run_in_threadpool(_movie, request, path)
+    return await kept_answer(
+        request, "application/json", version, pictures.source_levels, place, raw, gain, frame, seen, version
+    )
+
+
+@router.get("/jobs/{job_id}/frame.png", response_class=Response, responses=_PICTURE)
+async def job_frame_picture(
+    job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0, said: Version = ""
+) -> Response:
+    """Show a part of a frame of a job's movie."""
+    about, version = await run_in_threadpool(_job_movie, request, job_id)
+    return await kept_answer(
+        request, "image/png", version, pictures.source_png, *about, frame, seen, version, said=said
+    )
+
+
+@router.get("/jobs/{job_id}/histogram", response_class=Response, responses=_LEVELS)
+async def job_frame_histogram(job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0) -> Response:
+    """Tell what values a frame of a job's movie has, as its frame.png shows it with the same parameters."""
+    about, version = await run_in_threadpool(_job_movie, request, job_id)
+    return await kept_answer(request, "application/json", version, pictures.source_levels, *about, frame, seen, version)
+
+
+@router.get("/jobs/{job_id}/sum.png", response_class=Response, responses=_PICTURE)
+async def sum_picture(job_id: JobId, request: Request, seen: Seen, said: Version = "") -> Response:
+    """Show a part of a job's drift-corrected summed image, in counts of one frame."""
+    folder, version = await run_in_threadpool(_sum, request, job_id)
+    return await kept_answer(request, "image/png", version, pictures.sum_png, folder, seen, version, said=said)
+
+
+@router.get(
+    "/jobs/{job_id}/sum",
+    response_class=Response,
+    responses=_LEVELS,
+)
+async def sum_about(job_id: JobId, request: Request, seen: Seen) -> Response:
+    """Tell the size of a job's summed image, and what values it has."""
+    folder, version = await run_in_threadpool(_sum, request, job_id)
+    return await kept_answer(request, "application/json", version, pictures.sum_levels, folder, seen, version)
+
+
+def folder_of(request: Request, job_id: str) -> Path:
+    """Return the folder of a job's output."""
+    state = request.app.state
+    found: Path = state.root.resolve(state.store.job(job_id).output, must_exist=False)
+    return found
+
+
+def _movie(request: Request, path: str) -> tuple[str, str]:
+    place: str = request.app.state.root.source(path)
+    return place, _version(place)
+
+
+def _version(place: str) -> str:
+    outer = Path(place.partition("::")[0])
+    return stamp(outer / "zarr.json" if outer.suffix == ".zarr" else outer)
+
+
+def _job_movie(request: Request, job_id: str) -> tuple[tuple[str, SourceSettings, MetadataSettings], str]:
+    """Return where the movie of a job is, converted if it is already, and its version."""
+    state = request.app.state
+    job, converted = state.store.job(job_id), folder_of(request, job_id) / "movie.zarr"
+    place = str(converted) if stores.attributes(converted).get("complete") else state.root.source(job.source)
+    source = from_dict(SourceSettings, job.settings.get("source", {}))
+    metadata = from_dict(MetadataSettings, job.settings.get("metadata", {}))
+    return (place, source, metadata), _version(place)
+
+
+def _sum(request: Request, job_id: str) -> tuple[Path, str]:
+    """Return the folder of a job, and the version of its summed image.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there is none yet.
+    """
+    folder = folder_of(request, job_id)
+    about = folder / "sum.zarr" / "zarr.json"
+    if not about.is_file():
+        raise MissingStoreError(
+            "there is no summed image yet", job_id, "a job whose stage sum is done", remedy="Wait for it"
+        )
+    return folder, stamp(about)

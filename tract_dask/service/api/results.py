@@ -1,0 +1,157 @@
+"""What the jobs measured, also while they still measure: then the shards that are done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import FileResponse, StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from ...errors import MissingStoreError
+from ...shards import journal_beside
+from ..data import exports, tracks
+from .answers import NOT_MODIFIED, kept_answer, stamp
+from .models import JobId, errors
+from .previews import folder_of
+from .result_models import ColumnNumbers, Displacements, FrameNumbers, Prepared, Series, Summary
+
+router = APIRouter(tags=["results"])
+
+_ERRORS = errors(400, 404, 503) | NOT_MODIFIED
+_REPORT_POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'unsafe-inline' 'unsafe-eval'",
+        "style-src 'unsafe-inline'",
+        "img-src data: blob:",
+        "font-src data:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'self'",
+        "sandbox allow-scripts allow-downloads",
+    )
+)
+"""The report's own scripts may run, as of nobody: they reach neither the service nor anything else."""
+
+_DOWNLOAD: dict[int | str, dict[str, Any]] = errors(400, 404, 503) | {
+    200: {
+        "description": "The file; with ``prepare``, whether it is ready.",
+        "content": {
+            **{kind.partition(";")[0]: {} for kind in exports.FORMATS.values()},
+            "application/json": {"schema": {"$ref": "#/components/schemas/Prepared"}},
+        },
+    }
+}
+_PREPARE_S = 1.0
+
+Points = Annotated[int, Query(ge=2, le=20_000, description="Most points; longer series are averaged over frames.")]
+Frame = Annotated[int, Query(ge=0, le=2**53, description="Number of a frame, from 0.")]
+
+
+def _declared(model: type[Any]) -> dict[int | str, dict[str, Any]]:
+    return {200: {"model": model}} | _ERRORS
+
+
+@router.get("/jobs/{job_id}/results", response_class=Response, responses=_declared(Summary))
+async def results_summary(job_id: JobId, request: Request) -> Response:
+    """Tell how much of a job's movie is fitted, what was measured, and how."""
+    return await _answer(request, job_id, tracks.summary)
+
+
+@router.get("/jobs/{job_id}/results/columns", response_class=Response, responses=_declared(ColumnNumbers))
+async def results_columns(job_id: JobId, request: Request) -> Response:
+    """Tell of every column its place, its spread, its share of accepted fits, and its mean intensity."""
+    return await _answer(request, job_id, tracks.columns)
+
+
+@router.get("/jobs/{job_id}/results/series/{column_id}", response_class=Response, responses=_declared(Series))
+async def results_series(
+    job_id: JobId,
+    column_id: Annotated[int, PathParameter(ge=0, le=2**53, description="Number of a column.")],
+    request: Request,
+    start: Frame = 0,
+    stop: Annotated[int | None, Query(ge=1, le=2**53, description="After the last frame; none: all.")] = None,
+    points: Points = 2000,
+) -> Response:
+    """Show one column in time: where it was, and its intensity, of accepted fits."""
+    return await _answer(request, job_id, tracks.series, column_id, (start, stop), points)
+
+
+@router.get("/jobs/{job_id}/results/frames", response_class=Response, responses=_declared(FrameNumbers))
+async def results_frames(job_id: JobId, request: Request, points: Points = 1000) -> Response:
+    """Tell of every frame its drift, its share of accepted fits, and their mean amplitude."""
+    return await _answer(request, job_id, tracks.frames, points)
+
+
+@router.get("/jobs/{job_id}/results/displacement", response_class=Response, responses=_declared(Displacements))
+async def results_displacement(job_id: JobId, request: Request, first: Frame, second: Frame) -> Response:
+    """Tell how far every column moved from one frame to another, and how sure that is."""
+    return await _answer(request, job_id, tracks.displacement, first, second)
+
+
+@router.get("/jobs/{job_id}/results/download", response_class=Response, responses=_DOWNLOAD)
+async def download_results(
+    job_id: JobId,
+    request: Request,
+    format: Annotated[  # noqa: A002 (the name of the parameter in the address)
+        Literal["zarr", "nc", "csv"], Query(description="A zipped Zarr store, netCDF 4, or a table.")
+    ] = "zarr",
+    prepare: Annotated[bool, Query(description="Only make the file, and tell whether it is ready.")] = False,
+) -> Response:
+    """Download the tracks. Zarr comes at once; for other formats a file is made first, which may take minutes."""
+    path, version = await run_in_threadpool(_results, request, job_id)
+    name = f"tracks-{job_id}.{'zarr.zip' if format == 'zarr' else format}"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "private, no-store"}
+    if format == "zarr":
+        if prepare:
+            return Response(Prepared(ready=True, bytes=None).model_dump_json(), media_type="application/json")
+        return StreamingResponse(exports.zipped(path), media_type=exports.FORMATS[format], headers=headers)
+    made = await request.app.state.exports.made(path, version, format, _PREPARE_S if prepare else None)
+    if prepare:
+        ready = Prepared(ready=made is not None, bytes=made.stat().st_size if made else None)
+        return Response(ready.model_dump_json(), media_type="application/json")
+    return FileResponse(made, media_type=exports.FORMATS[format], headers=headers)
+
+
+@router.get(
+    "/jobs/{job_id}/report",
+    response_class=Response,
+    responses=errors(404) | {200: {"description": "One page.", "content": {"text/html": {}}}},
+)
+def read_report(job_id: JobId, request: Request) -> Response:
+    """Show the report of a job that is done."""
+    place = folder_of(request, job_id) / "report.html"
+    if not place.is_file():
+        raise MissingStoreError(
+            "there is no report", place.parent.name, "the job to be done", remedy="Wait until the job is done"
+        )
+    headers = {"Content-Security-Policy": _REPORT_POLICY, "Cache-Control": "private, no-cache"}
+    return FileResponse(place, media_type="text/html; charset=utf-8", headers=headers)
+
+
+async def _answer(request: Request, job_id: str, function: Callable[..., bytes], *args: Any) -> Response:
+    path, version = await run_in_threadpool(_results, request, job_id)
+    places: tuple[Path, ...] = (path.parent, request.app.state.config.state / "tracks")
+    if function is tracks.displacement:
+        places = places[:1]
+    return await kept_answer(request, "application/json", version, function, *places, *args, version)
+
+
+def _results(request: Request, job_id: str) -> tuple[Path, str]:
+    """Return where the results of a job are, and their version.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there are none yet.
+    """
+    path = folder_of(request, job_id) / "results.zarr"
+    if not (path / "zarr.json").is_file():
+        raise MissingStoreError(
+            "there are no results yet", job_id, "a job whose fits have begun", remedy="Wait for the stage fit"
+        )
+    return path, stamp(path / "zarr.json", journal_beside(path))

@@ -1,0 +1,87 @@
+"""The web application: the API, the pages, and what stands in front of both."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+from fastapi import Depends, FastAPI
+from fastapi.routing import APIRoute
+from fastapi.security import HTTPBearer
+
+from . import problems
+from .api import columns, events, files, health, jobs, plan, previews, results
+from .config import ServiceConfig
+from .dashboard import Upstream, dashboard
+from .data.exports import Exports
+from .data.workshop import Workshop
+from .entrance.access import Access
+from .entrance.gate import Gate
+from .entrance.headers import BodyLimit, SecurityHeaders
+from .entrance.login import login
+from .feed import Feed
+from .folders import DataRoot
+from .jobs.store import JobStore
+from .metrics import CountRequests, Metrics
+from .pages import pages, static_files
+from .running.runner import Runner
+
+PREFIX = "/api/v1"
+
+_BEARER = HTTPBearer(
+    auto_error=False,  # for the document only: the gate has asked already
+    scheme_name="token",
+    description="As tract-dask token create shows it; browsers log in instead.",
+)
+
+
+def _operation_id(route: APIRoute) -> str:
+    return route.name
+
+
+def create_app(config: ServiceConfig) -> FastAPI:
+    """Return the application; its runner starts and stops with it."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.state.runner.start()
+        app.state.workshop.start()
+        try:
+            yield
+        finally:
+            app.state.feed.close()
+            await app.state.upstream.close()
+            app.state.runner.stop()
+            app.state.workshop.close()
+
+    app = FastAPI(
+        title="tract_dask",
+        version=version("tract_dask"),
+        openapi_url=f"{PREFIX}/openapi.json",
+        docs_url=None,  # it loads scripts from elsewhere
+        redoc_url=None,
+        generate_unique_id_function=_operation_id,
+        lifespan=lifespan,
+    )
+    config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
+    app.state.config, app.state.root = config, DataRoot(config.data_root)
+    app.state.store, app.state.workshop = JobStore(config.database), Workshop()
+    app.state.exports = Exports(config.state / "exports", app.state.workshop)
+    app.state.feed = Feed(app.state.store)
+    app.state.metrics = Metrics(app.state.store, app.state.feed)
+    app.state.access = Access(app.state.store, config)
+    app.state.runner, app.state.upstream = Runner(config, app.state.store), Upstream(config.cluster.tls)
+    problems.install(app)
+    documented = [Depends(_BEARER)] if app.state.access.demanded else []
+    for part in (jobs, events, files, plan, previews, columns, results, health):
+        app.include_router(part.router, prefix=PREFIX, dependencies=documented)
+    app.include_router(pages)
+    app.include_router(login)
+    app.include_router(dashboard)
+    app.mount("/static", static_files, name="static")
+    app.add_middleware(BodyLimit, most=config.max_body_bytes)  # the last one added is the first to see a request
+    app.add_middleware(Gate, access=app.state.access, config=config)
+    app.add_middleware(SecurityHeaders)
+    app.add_middleware(CountRequests, metrics=app.state.metrics)
+    return app

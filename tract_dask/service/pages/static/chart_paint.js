@@ -1,0 +1,113 @@
+// What a chart draws on its canvas: lines, bands, points and bars.
+
+import { firstNotBelow } from "./chart_scale.js";
+
+/** Draw a series of charts.js in `colour`; `place` maps x and y to px, `box` is the inside of the axes. */
+export function paintSeries(pen, one, colour, [x0, x1], place, box) {
+  if (!one.y.length) return;
+  pen.strokeStyle = pen.fillStyle = colour;
+  if (one.kind === "bars") { paintBars(pen, one, place, box); return; }
+  const start = Math.max(0, firstNotBelow(one.x, x0) - 1), stop = Math.min(one.y.length, firstNotBelow(one.x, x1) + 1);
+  if (one.low) paintBand(pen, one, start, stop, place);
+  pen.lineWidth = 1.6;
+  pen.lineJoin = "round";
+  pen.setLineDash(one.dashed ? [5, 4] : []);
+  const runs = one.kind === "points" ? [] : thinned(one.x, one.y, start, stop, place);
+  for (const run of runs) {
+    pen.beginPath();
+    for (const [x, y] of run) pen.lineTo(x, y);
+    pen.stroke();
+    if (run.length === 1 && one.kind !== "dots") dot(pen, ...run[0], 1.6, colour);
+    if (one.kind === "area" && run.length > 1) {
+      pen.lineTo(run[run.length - 1][0], box.bottom);
+      pen.lineTo(run[0][0], box.bottom);
+      pen.globalAlpha = 0.14;
+      pen.fill();
+      pen.globalAlpha = 1;
+    }
+  }
+  pen.setLineDash([]);
+  if (one.kind !== "points" && one.kind !== "dots") return;
+  const size = Math.max(1, Math.min(2.6, (box.right - box.left) / (stop - start) / 2.5));
+  for (let index = start; index < stop; index += 1) {
+    if (known(one.y[index])) dot(pen, place.x(one.x[index]), place.y(one.y[index]), size, colour);
+  }
+}
+
+function paintBars(pen, one, place, box) {
+  const floor = Math.min(place.y(0), box.bottom);
+  pen.globalAlpha = 0.75;
+  one.y.forEach((value, index) => {
+    const left = place.x(one.x[index]), right = place.x(one.x[index + 1]), top = place.y(value);
+    if (value) pen.fillRect(left + 0.5, top, Math.max(right - left - 1, 1), floor - top);
+  });
+  pen.globalAlpha = 1;
+}
+
+function paintBand(pen, one, start, stop, place) {
+  pen.globalAlpha = 0.2;
+  for (let from = start; from < stop; from += 1) {
+    let to = from;
+    while (to < stop && known(one.low[to]) && known(one.high[to])) to += 1;
+    if (to - from > 1) {
+      pen.beginPath();
+      for (let index = from; index < to; index += 1) pen.lineTo(place.x(one.x[index]), place.y(one.high[index]));
+      for (let index = to - 1; index >= from; index -= 1) pen.lineTo(place.x(one.x[index]), place.y(one.low[index]));
+      pen.fill();
+    } else if (to - from === 1) {
+      const x = place.x(one.x[from]);
+      stroke(pen, x, place.y(one.low[from]), x, place.y(one.high[from]));
+    }
+    from = to;
+  }
+  pen.globalAlpha = 1;
+}
+
+/** The runs between gaps as points in px; where several fall on a pixel, its first, lowest, highest and last. */
+function thinned(xs, ys, start, stop, place) {
+  const runs = [];
+  let run = null, column = null;
+  const flush = () => {
+    if (!column) return;
+    const { first, low, high, last } = column;
+    run.push(first);
+    if (low !== first && low !== last) run.push(low);
+    if (high !== first && high !== last && high !== low) run.push(high);
+    if (last !== first) run.push(last);
+    column = null;
+  };
+  for (let index = start; index < stop; index += 1) {
+    if (!known(ys[index])) { flush(); run = null; continue; }
+    if (!run) runs.push(run = []);
+    const point = [place.x(xs[index]), place.y(ys[index])], pixel = Math.floor(point[0]);
+    if (column?.pixel !== pixel) { flush(); column = { pixel, first: point, low: point, high: point, last: point }; continue; }
+    column.last = point;
+    if (point[1] < column.low[1]) column.low = point;
+    if (point[1] > column.high[1]) column.high = point;
+  }
+  flush();
+  return runs;
+}
+
+const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
+
+/** Draw a straight line. */
+export function stroke(pen, x0, y0, x1, y1) {
+  pen.lineWidth = 1;
+  pen.beginPath();
+  pen.moveTo(x0, y0);
+  pen.lineTo(x1, y1);
+  pen.stroke();
+}
+
+/** Draw a disc, with an edge where it shall stand out. */
+export function dot(pen, x, y, radius, colour, edge = "") {
+  pen.beginPath();
+  pen.arc(x, y, radius, 0, 2 * Math.PI);
+  pen.fillStyle = colour;
+  pen.fill();
+  if (!edge) return;
+  pen.strokeStyle = edge;
+  pen.lineWidth = 1.5;
+  pen.stroke();
+}

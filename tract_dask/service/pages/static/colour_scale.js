@@ -1,0 +1,39 @@
+// What the colours of columns mean: a bar with its ends in numbers, and the columns themselves.
+
+import { theme } from "./api.js";
+import { h, setText } from "./dom.js";
+import { significant } from "./format.js";
+import { viridis } from "./results_colours.js";
+
+/** A bar with its two ends in numbers. */
+export class ColourBar {
+  constructor(element) {
+    this.canvas = h("canvas", { width: 256, height: 1, class: "colour-bar", "aria-hidden": "true" });
+    this.low = h("span", { class: "tabular" });
+    this.high = h("span", { class: "tabular" });
+    element.classList.add("colour-scale");
+    element.replaceChildren(this.low, this.canvas, this.high);
+    const pen = this.canvas.getContext("2d");
+    for (let x = 0; x < 256; x += 1) { pen.fillStyle = viridis(x / 255); pen.fillRect(x, 0, 1, 1); }
+  }
+
+  /** Show a scale of results_colours.js; `format` turns a value into text. Null hides the bar. */
+  show(scale, format = (value) => significant(value, 3)) {
+    this.canvas.style.visibility = scale ? "" : "hidden";
+    setText(this.low, scale ? format(scale.low) : "");
+    setText(this.high, scale ? `${format(scale.high)}${scale.more ? " and more" : ""}` : "");
+  }
+}
+
+/** Draw a column: a disc of its value's colour, or a ring where it has none. `pen` is a canvas context in CSS px. */
+export function drawColumn(pen, { x, y }, radius, colour) {
+  pen.beginPath();
+  pen.arc(x, y, radius, 0, 2 * Math.PI);
+  if (colour) {
+    pen.fillStyle = colour;
+    pen.fill();
+  }
+  pen.lineWidth = colour ? 1.2 : 1.6;
+  pen.strokeStyle = colour ? "rgb(255 255 255 / .85)" : theme.color("--series-2");
+  pen.stroke();
+}

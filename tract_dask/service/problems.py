@@ -1,0 +1,151 @@
+"""What goes wrong, as an HTTP response: one shape of body for every error, and one table of status codes."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse, Response
+
+from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
+from .folders import OutsideError
+from .jobs.store import ConflictError, UnknownJobError
+
+log = logging.getLogger(__name__)
+
+
+class ForbiddenError(InputError):
+    """Who asks is known, and may not do this."""
+
+
+class NoTokenError(InputError):
+    """Who asks is not known."""
+
+
+class TooLargeError(InputError):
+    """The body of the request is larger than the service takes."""
+
+
+class TooManyError(InputError):
+    """Too many attempts in a short time."""
+
+
+STATUS: dict[type[TractError], int] = {
+    NoTokenError: 401,
+    ForbiddenError: 403,
+    OutsideError: 403,
+    UnknownJobError: 404,
+    MissingStoreError: 404,
+    ConflictError: 409,
+    TooLargeError: 413,
+    TooManyError: 429,
+    ClusterError: 503,
+    InputError: 400,
+    StoreError: 500,
+    TractError: 500,
+}
+"""Status codes of errors; the nearest ancestor counts."""
+
+
+class Problem(BaseModel):
+    """An error with its place and its remedy."""
+
+    what: str = Field(description="What is wrong.", examples=["there is no job with this id"])
+    where: str = Field("", description="File, setting, field or route.", examples=["0123456789"])
+    expected: str = Field("", description="What was needed.")
+    got: str = Field("", description="What was found.")
+    remedy: str = Field("", description="What to do.", examples=["List the jobs"])
+    text: str = Field(description="All of it as one paragraph.")
+    kind: str = Field(description="Its class, as in tract_dask.errors.", examples=["UnknownJobError"])
+
+
+class ErrorBody(BaseModel):
+    """The body of every response that is an error."""
+
+    error: Problem
+
+
+ERRORS: dict[int | str, dict[str, Any]] = {
+    400: {"model": ErrorBody, "description": "The input cannot be used."},
+    401: {"model": ErrorBody, "description": "No token, or one that is wrong, revoked or expired."},
+    403: {"model": ErrorBody, "description": "Not allowed: of another owner, outside the data root, or cross-site."},
+    404: {"model": ErrorBody, "description": "There is no such job, file or result."},
+    409: {"model": ErrorBody, "description": "The job's state forbids it."},
+    413: {"model": ErrorBody, "description": "The body is too large."},
+    422: {"model": ErrorBody, "description": "A field is missing or invalid."},
+    500: {"model": ErrorBody, "description": "The service failed."},
+    503: {"model": ErrorBody, "description": "The cluster does not answer."},
+}
+"""What every route of the API may answer with, for its OpenAPI document."""
+
+
+def answer(error: TractError, root: str = "", headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """Return the response for an error; paths in it are shown relative to the folder ``root``."""
+    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    return JSONResponse(body(error, root), status, headers)
+
+
+def body(error: TractError, root: str = "") -> dict[str, dict[str, str]]:
+    """Return the body of the response for an error."""
+    parts = {name: str(getattr(error, name)) for name in ("what", "where", "expected", "got", "remedy")}
+    parts["text"] = str(error)
+    if root:
+        parts = {name: text.replace(f"{root}/", "").replace(root, "the data root") for name, text in parts.items()}
+    return {"error": parts | {"kind": type(error).__name__}}
+
+
+def install(app: FastAPI) -> None:
+    """Let the application answer every error in one shape."""
+    app.add_exception_handler(TractError, _tract_error)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _tract_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, TractError)
+    found = answer(error, str(request.app.state.root.path))
+    if found.status_code >= HTTPStatus.INTERNAL_SERVER_ERROR:
+        log.warning("%s %s: %s", request.method, request.url.path, error)
+    return _as_asked(request, found)
+
+
+def _invalid(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    first: Mapping[str, Any] = error.errors()[0]
+    where = ".".join(str(part) for part in _place(first.get("loc", ())))
+    problem = TractError(str(first.get("msg", "a field is invalid")), where, remedy="Correct it and send it again")
+    return JSONResponse(body(problem), HTTPStatus.UNPROCESSABLE_ENTITY)
+
+
+def _place(loc: Sequence[Any]) -> Sequence[Any]:
+    return loc[1:] if len(loc) > 1 else loc
+
+
+def _http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    problem = TractError(str(error.detail), f"{request.method} {request.url.path}")
+    return _as_asked(request, JSONResponse(body(problem), error.status_code, error.headers))
+
+
+def _as_asked(request: Request, found: JSONResponse) -> Response:
+    """Return an error as a page where a browser asks for one, else as it is."""
+    if request.url.path.startswith("/api/") or "text/html" not in request.headers.get("accept", ""):
+        return found
+    from .pages import error_page  # which needs to know who asks, and with it the errors of this file
+
+    return error_page(request, json.loads(bytes(found.body))["error"], found.status_code)
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    problem = TractError(
+        "the service failed", f"{request.method} {request.url.path}", remedy="Try again; its log says why it failed"
+    )
+    return JSONResponse(body(problem), HTTPStatus.INTERNAL_SERVER_ERROR)

@@ -1,0 +1,97 @@
+"""Encrypted traffic between scheduler, workers and clients: a folder of certificates as Dask takes it."""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+
+from distributed.security import Security
+
+from .errors import ClusterError
+
+
+def security(folder: str | None) -> Security | None:
+    """Return what Dask needs to encrypt with the certificates in ``folder`` (:mod:`tract_dask.certificates`), or None.
+
+    Both ends of every connection have to show a certificate that ``ca.pem`` has signed; nothing unencrypted is spoken.
+
+    Raises
+    ------
+    ClusterError
+        Where a file of the folder is missing or cannot be read.
+    """
+    if folder is None:
+        return None
+    from .certificates import CA, DASK, DASK_KEY  # takes its time to import
+
+    files = [Path(folder).absolute() / name for name in (CA, DASK, DASK_KEY)]
+    for file in files:
+        try:
+            file.read_bytes()
+        except OSError as error:
+            raise ClusterError(
+                "a certificate is missing",
+                "setting tls (ClusterSettings)",
+                f"{CA}, {DASK} and {DASK_KEY} in {folder}",
+                str(error),
+                f"Make them with: tract-dask certs {folder}",
+            ) from error
+    authority, certificate, key = map(str, files)
+    return Security(
+        require_encryption=True,
+        tls_ca_file=authority,
+        **{f"tls_{role}_cert": certificate for role in ("client", "scheduler", "worker")},
+        **{f"tls_{role}_key": key for role in ("client", "scheduler", "worker")},
+    )
+
+
+def web_context(folder: str | None) -> ssl.SSLContext | None:
+    """Return how to check the certificate of a dashboard that uses those in ``folder``; None without a folder."""
+    if folder is None:
+        return None
+    from .certificates import CA
+
+    return ssl.create_default_context(cafile=Path(folder) / CA)
+
+
+def worker_flags(used: Security | None) -> list[str]:
+    """Return the options of ``dask worker`` with which a worker belongs to a cluster that uses this security."""
+    if used is None or not used.require_encryption:
+        return []
+    found = used.get_tls_config_for_role("worker")
+    return [part for name in ("ca_file", "cert", "key") for part in (f"--tls-{name.replace('_', '-')}", found[name])]
+
+
+def checked_address(address: str, folder: str | None) -> str:
+    """Return a scheduler's address with its protocol, after a look whether that fits the certificates.
+
+    Raises
+    ------
+    ClusterError
+        Where the address says that traffic is encrypted and there are no certificates, or the other way round.
+
+    Examples
+    --------
+    >>> checked_address("node1:8786", None), checked_address("node1:8786", "certificates")
+    ('tcp://node1:8786', 'tls://node1:8786')
+    """
+    protocol, separator, rest = address.rpartition("://")
+    if not separator:
+        return f"{'tls' if folder else 'tcp'}://{rest}"
+    if protocol == "tls" and folder is None:
+        raise ClusterError(
+            "the scheduler speaks TLS and no certificates are given",
+            address,
+            "a folder of certificates (--tls)",
+            "none",
+            "Give the folder with which the scheduler was started",
+        )
+    if protocol == "tcp" and folder is not None:
+        raise ClusterError(
+            "certificates are given and the scheduler's traffic is not encrypted",
+            address,
+            "an address that begins with tls://",
+            f"{protocol}:// with the certificates in {folder}",
+            "Start scheduler and workers with the certificates (docs/deploy.md), or leave them out",
+        )
+    return address
