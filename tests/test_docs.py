@@ -50,6 +50,20 @@ def call(*command: str, folder: Path, timeout: int = 300) -> str:
     return printed
 
 
+@contextlib.contextmanager
+def served(block: str, folder: Path):
+    """A service that a reader starts in one terminal, while the next commands run in another."""
+    process = subprocess.Popen(
+        ["bash", "-c", f"exec {block}"], cwd=folder, env=os.environ | {"PATH": PATH}, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert any("http://127.0.0.1:8000" in line for line in process.stdout), "it did not start"
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A folder with a small movie and the scripts of the checkout, in which a reader's commands run."""
@@ -83,9 +97,14 @@ def test_commands_and_examples_of_the_readme(folder):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     commands = blocks("README.md", "bash")
     assert commands
-    for block in commands:
-        assert RUN_BY not in block
-        call("bash", "-euo", "pipefail", "-c", block, folder=folder)
+    with contextlib.ExitStack() as services:
+        for block in commands:
+            assert RUN_BY not in block
+            if block.startswith("tract-dask serve"):
+                services.enter_context(served(block, folder))
+            else:
+                call("bash", "-euo", "pipefail", "-c", block, folder=folder)
+    assert list(folder.glob("jobs/*/results.zarr")), "what was submitted to the service"
     assert (folder / "demo_output" / "movie.tif").exists()
     for name in re.findall(r"^\| (`.*?`) \|", text, flags=re.MULTILINE):
         for path in re.findall(r"`(.*?)`", name):

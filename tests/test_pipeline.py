@@ -140,6 +140,7 @@ def test_changed_pixel_size_and_time_are_only_written_down(done):
     for path in (outcome.outputs.drift, outcome.outputs.sum, outcome.outputs.columns.with_suffix(".zarr")):
         assert stores.open_dataset(path).attrs["pixel_size_pm"] == 7.8
     assert open_results(outcome.outputs.results).attrs["pixel_size_pm"] == 7.8
+    assert xr.open_zarr(outcome.outputs.results, consolidated=False).attrs["pixel_size_pm"] == 7.8
     assert tomllib.loads(outcome.outputs.settings.read_text())["metadata"]["frame_time_s"] == 0.5
 
 

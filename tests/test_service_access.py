@@ -15,15 +15,16 @@ from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from tract_dask.certificates import make_certificates
 from tract_dask.errors import DestinationError, InputError
+from tract_dask.service import serving
 from tract_dask.service.app import create_app
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.dashboard import dashboard
-from tract_dask.service.entrance import gate, serving
+from tract_dask.service.entrance import gate
 from tract_dask.service.entrance.access import Attempts, Credential, Identity, may_change
 from tract_dask.service.entrance.login import login
 from tract_dask.service.jobs.states import State
 from tract_dask.service.pages import pages
-from tract_dask.service.problems import ForbiddenError, TooManyError
+from tract_dask.service.refusals import ForbiddenError, TooManyError
 from tract_dask.settings import ClusterSettings
 
 HERE = "http://localhost:8000"
@@ -322,7 +323,6 @@ def test_browsers_are_told_what_they_may_do(open_client):
         if status == 500:
             assert "ZeroDivision" not in answer.text
             assert answer.json()["error"]["what"] == "the service failed"
-            continue  # written by the server's outermost part
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert answer.headers["x-frame-options"] == "DENY"
         policy = dict(part.split(" ", 1) for part in answer.headers["content-security-policy"].split("; "))
@@ -332,6 +332,21 @@ def test_browsers_are_told_what_they_may_do(open_client):
         assert {"referrer-policy", "permissions-policy"} <= set(answer.headers)
         assert "strict-transport-security" not in answer.headers
         assert "server" not in answer.headers
+
+
+@pytest.mark.parametrize("part", ["identify", "page"])
+def test_what_nobody_foresaw_is_a_page_for_a_browser_and_tells_nothing(guarded, client, tokens, monkeypatch, part):
+    """Also where the gate itself fails, before it knows who asks."""
+    if part == "identify":
+        monkeypatch.setattr(guarded.state.access, "identify", lambda credential: 1 / 0)
+    else:
+        monkeypatch.setattr(guarded.state.store, "job", lambda job_id: 1 / 0)
+    answer = client.get("/jobs/0123456789", headers=bearer(tokens["user"]) | {"Accept": "text/html"})
+    assert (answer.status_code, answer.headers["content-type"]) == (500, "text/html; charset=utf-8")
+    assert "The service failed" in answer.text
+    assert "ZeroDivision" not in answer.text
+    assert "default-src 'self'" in answer.headers["content-security-policy"]
+    assert answer.headers["cache-control"] == "no-store"
 
 
 def test_errors_have_one_shape_and_show_no_folder(open_client, tmp_path):

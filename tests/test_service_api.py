@@ -436,18 +436,23 @@ def test_many_streams_take_one_reader_and_all_get_everything(tmp_path):
 
         store.events = counted
 
-        async def listen() -> list[bytes]:
-            return [chunk async for chunk in feed.listen(store.newest_event())]
+        found: list[list[bytes]] = [[] for _ in range(60)]
 
-        tasks = [asyncio.create_task(listen()) for _ in range(60)]
+        async def listen(chunks: list[bytes]) -> None:
+            async for chunk in feed.listen(store.newest_event()):
+                chunks.append(chunk)  # noqa: PERF401  (looked at while it grows)
+
+        tasks = [asyncio.create_task(listen(chunks)) for chunks in found]
         while len(feed) < 60:
             await asyncio.sleep(0.01)
         await asyncio.sleep(0.3)
         for k in range(200):
             other.log(job.id, "info", str(k))  # as another process would
-        await asyncio.sleep(0.6)
+        async with asyncio.timeout(30):
+            while any(len(chunks) < 200 for chunks in found):
+                await asyncio.sleep(0.01)
         feed.close()
-        found = await asyncio.gather(*tasks)
+        await asyncio.gather(*tasks)
         assert all(len(chunks) == 200 for chunks in found)
         assert len({b"".join(chunks) for chunks in found}) == 1
         assert reads < 60 + 15  # each looked once into the past

@@ -155,6 +155,18 @@ def test_a_movie_is_chosen_looked_at_and_measured_from_the_page(chromium, tmp_pa
         accepted = _numbers(page.locator("#accepted canvas").get_attribute("aria-label"))
         assert min(accepted) > 90
         assert max(accepted) <= 100
+        expect(page.locator("#colour-by")).to_be_enabled()
+        box, (height, width), (x, y) = page.locator("#picture").bounding_box(), scene.shape, scene.place[3]
+        scale = min((box["width"] - 8) / width, (box["height"] - 8) / height)
+        page.mouse.move(
+            box["x"] + box["width"] / 2 + scale * (x - (width - 1) / 2),
+            box["y"] + box["height"] / 2 + scale * (y - (height - 1) / 2),
+        )
+        column = re.match(r"Column (\d+)", page.locator("#pointed").text_content())[1]
+        page.mouse.down()
+        page.mouse.up()
+        page.wait_for_url(f"**/jobs/{job}/results#columns={column}")
+        expect(page.locator("#chosen li")).to_have_text(f"{column}×")
 
 
 def _numbers(text: str) -> list[float]:

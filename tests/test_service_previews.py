@@ -152,7 +152,7 @@ def service(tmp_path_factory):
         tmp_path / "movie.npy",
         tmp_path / "out" / "movie.zarr",
         settings=ConvertSettings(tile_px=16),
-        metadata=MetadataSettings(gain=2.0),
+        metadata=MetadataSettings(pixel_size_pm=8.0, gain=2.0),
     )
     image = np.random.default_rng(1).normal(20, 3, (20, 30))
     exposure = np.full((20, 30), 5, np.uint32)
@@ -225,6 +225,7 @@ def test_histograms_of_frames(service):
     assert found["range"] == [service.movie[2].min(), service.movie[2].max()]
     of_job = service.get(f"{service.job}/histogram?frame=2&width=30").json()
     np.testing.assert_allclose(of_job["range"], 2 * np.array(found["range"]))
+    assert (found["pixel_size_pm"], of_job["pixel_size_pm"]) == (None, 8.0)
 
 
 @pytest.mark.parametrize(

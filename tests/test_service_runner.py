@@ -477,22 +477,13 @@ def test_a_process_ends_with_its_standard_input(whole, client, tmp_path):
 
 @pytest.mark.slow
 def test_what_is_killed_goes_on_and_ends_with_the_same_bytes(tmp_path):
-    """The service with all at once, the process that holds the cluster, and a job's process; a small movie."""
-    options = [
-        "--moments",
-        "3",
-        "--targets",
-        "work,cluster,all",
-        "--longest",
-        "0.3",
-        "--jobs",
-        "1",
-        "--concurrency",
-        "1",
-    ]
-    options += ["--frames", "12", "--folder", tmp_path]
+    """The service, a worker, and all at once, with a small movie; the script's own choice is longer."""
+    options = "--moments 3 --targets service,worker,all --longest 0.3 --jobs 1 --concurrency 1 --workers 1 --frames 12"
     found = subprocess.run(
-        [sys.executable, ROOT / "scripts" / "service_kill_test", *options], capture_output=True, text=True, check=False
+        [sys.executable, ROOT / "scripts" / "service_kill_test", *options.split(), "--folder", tmp_path],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert found.returncode == 0, found.stdout + found.stderr
     assert "jobs done and identical" in found.stdout

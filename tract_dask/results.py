@@ -23,6 +23,9 @@ from .settings import FitSettings, from_toml
 from .shard_files import BLOSC, encode
 from .shards import Shard, entries, journal_beside
 
+CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose")
+"""What pixels and frames mean: attributes of the store, which any reader finds there."""
+
 _CODEC = "lz4"
 FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
 """The variables that :func:`accepted` masks."""
@@ -63,7 +66,8 @@ def create(
     static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
     for name in (*_KNOWN_AT_START, *schema.COLUMNS):
         static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
-    static.attrs = {stores.ATTRIBUTE: stores.json_ready({**about, "complete": False})}
+    static.attrs = {name: about.get(name) for name in CALIBRATION}
+    static.attrs[stores.ATTRIBUTE] = stores.json_ready({**about, "complete": False})
     aside = path.with_name(f".{path.name}.partial")
     with stores.disk_errors(path):
         stores.remove(aside)
@@ -104,7 +108,7 @@ def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
     if any(stores.attributes(path).get(name) != value for name, value in about.items()):
         zarr.open_array(str(path / "time"), mode="r+")[...] = time
-        stores.update_attributes(path, **about)
+        stores.update_attributes(path, plain=about, **about)
 
 
 def finished_shards(path: Path) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -167,8 +171,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
     dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
-    for key in ("pixel_size_pm", "frame_time_s", "dose"):
-        dataset.attrs[key] = about.get(key)
+    dataset.attrs |= {name: about.get(name) for name in CALIBRATION}
     settings = from_toml(FitSettings, about["settings"], str(path))
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
     return dataset

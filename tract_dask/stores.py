@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,11 +82,16 @@ def attributes(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def update_attributes(path: Path, **changes: Any) -> None:
-    """Change what the store at ``path`` says of itself; written aside, then renamed."""
+def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **changes: Any) -> None:
+    """Change what the store at ``path`` says of itself; written aside, then renamed.
+
+    ``plain`` are attributes that stand beside :data:`ATTRIBUTE`, for other readers.
+    """
     file = path / "zarr.json"
     metadata = json.loads(file.read_text(encoding="utf-8"))
-    metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {}).update(changes)
+    attributes = metadata.setdefault("attributes", {})
+    attributes.update(plain or {})
+    attributes.setdefault(ATTRIBUTE, {}).update(changes)
     write_aside(file, json.dumps(metadata, indent=2).encode())
 
 

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from fastapi import Depends, FastAPI
 from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer
+from starlette.middleware.errors import ServerErrorMiddleware
 
 from . import problems
 from .api import columns, events, files, health, jobs, plan, previews, results
@@ -82,6 +83,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
     app.mount("/static", static_files, name="static")
     app.add_middleware(BodyLimit, most=config.max_body_bytes)  # the last one added is the first to see a request
     app.add_middleware(Gate, access=app.state.access, config=config)
+    app.add_middleware(ServerErrorMiddleware, handler=problems.unexpected)  # what it answers has the headers, too
     app.add_middleware(SecurityHeaders)
     app.add_middleware(CountRequests, metrics=app.state.metrics)
     return app

@@ -159,7 +159,7 @@ async def _exchange(client: WebSocket, upstream: websockets.ClientConnection) ->
         for way in ways:
             way.cancel()
         await asyncio.gather(*ways, return_exceptions=True)
-    with suppress(RuntimeError):  # the browser has closed it already
+    with suppress(RuntimeError, WebSocketDisconnect):  # the browser has closed it already
         await client.close(_GOING_AWAY)
 
 

@@ -178,7 +178,7 @@ def _method(method: str) -> str:
 
 def _template(scope: Scope) -> str:
     """Return the template of the route that took the request, with its prefix; one name for all that none took."""
-    path = getattr(scope.get("route"), "path", None)
+    path = getattr(scope.get("route"), "path_format", None)
     if not isinstance(path, str):
         return "/static" if scope["path"].startswith("/static/") else "none"
     prefix = _API if scope["path"].startswith(f"{_API}/") and not path.startswith(_API) else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from http import HTTPStatus
+from http import HTTPMethod, HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -13,28 +13,15 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
+from starlette.routing import Match
 
 from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
 from .folders import OutsideError
-from .jobs.store import ConflictError, UnknownJobError
+from .jobs.store import ConflictError, UnknownJobError, UnknownVersionError
+from .pages import error_page
+from .refusals import ForbiddenError, NoTokenError, TooLargeError, TooManyError
 
 log = logging.getLogger(__name__)
-
-
-class ForbiddenError(InputError):
-    """Who asks is known, and may not do this."""
-
-
-class NoTokenError(InputError):
-    """Who asks is not known."""
-
-
-class TooLargeError(InputError):
-    """The body of the request is larger than the service takes."""
-
-
-class TooManyError(InputError):
-    """Too many attempts in a short time."""
 
 
 STATUS: dict[type[TractError], int] = {
@@ -42,6 +29,7 @@ STATUS: dict[type[TractError], int] = {
     ForbiddenError: 403,
     OutsideError: 403,
     UnknownJobError: 404,
+    UnknownVersionError: 404,
     MissingStoreError: 404,
     ConflictError: 409,
     TooLargeError: 413,
@@ -76,7 +64,7 @@ ERRORS: dict[int | str, dict[str, Any]] = {
     400: {"model": ErrorBody, "description": "The input cannot be used."},
     401: {"model": ErrorBody, "description": "No token, or one that is wrong, revoked or expired."},
     403: {"model": ErrorBody, "description": "Not allowed: of another owner, outside the data root, or cross-site."},
-    404: {"model": ErrorBody, "description": "There is no such job, file or result."},
+    404: {"model": ErrorBody, "description": "There is no such job, file, version or result."},
     409: {"model": ErrorBody, "description": "The job's state forbids it."},
     413: {"model": ErrorBody, "description": "The body is too large."},
     422: {"model": ErrorBody, "description": "A field is missing or invalid."},
@@ -102,11 +90,10 @@ def body(error: TractError, root: str = "") -> dict[str, dict[str, str]]:
 
 
 def install(app: FastAPI) -> None:
-    """Let the application answer every error in one shape."""
+    """Let the application answer every error that a route may raise in one shape."""
     app.add_exception_handler(TractError, _tract_error)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http)
-    app.add_exception_handler(Exception, _unexpected)
 
 
 def _tract_error(request: Request, error: Exception) -> Response:
@@ -132,20 +119,29 @@ def _place(loc: Sequence[Any]) -> Sequence[Any]:
 def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     problem = TractError(str(error.detail), f"{request.method} {request.url.path}")
-    return _as_asked(request, JSONResponse(body(problem), error.status_code, error.headers))
+    headers = dict(error.headers or {})
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED and (methods := _methods(request)):
+        headers["Allow"] = ", ".join(methods)  # the framework names those of one route only
+    return _as_asked(request, JSONResponse(body(problem), error.status_code, headers))
+
+
+def _methods(request: Request) -> list[str]:
+    """Return the methods that the path of a request takes."""
+    asked = ({**request.scope, "method": method} for method in HTTPMethod)
+    routes = request.app.routes
+    return [scope["method"] for scope in asked if any(route.matches(scope)[0] == Match.FULL for route in routes)]
 
 
 def _as_asked(request: Request, found: JSONResponse) -> Response:
     """Return an error as a page where a browser asks for one, else as it is."""
     if request.url.path.startswith("/api/") or "text/html" not in request.headers.get("accept", ""):
         return found
-    from .pages import error_page  # which needs to know who asks, and with it the errors of this file
-
     return error_page(request, json.loads(bytes(found.body))["error"], found.status_code)
 
 
-def _unexpected(request: Request, error: Exception) -> Response:
+def unexpected(request: Request, error: Exception) -> Response:
+    """Return the response for what nobody foresaw; it tells nothing of it."""
     problem = TractError(
         "the service failed", f"{request.method} {request.url.path}", remedy="Try again; its log says why it failed"
     )
-    return JSONResponse(body(problem), HTTPStatus.INTERNAL_SERVER_ERROR)
+    return _as_asked(request, JSONResponse(body(problem), HTTPStatus.INTERNAL_SERVER_ERROR))

@@ -23,19 +23,21 @@ from ..entrance.access import Identity, Role, identity, may_change
 from ..jobs.states import CURATABLE, State
 from ..jobs.store import Job, JobStore
 from ..planning import inside
-from .models import JobId, JobRecord, Text, errors
+from .models import JobId, JobRecord, Plain, Text, errors
 from .previews import folder_of
 
 router = APIRouter(tags=["columns"])
 
 _FAR = 1e6
-_Px = Annotated[float, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
+_Px = Annotated[float, Plain, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
 _Place = Annotated[
-    tuple[_Px, _Px], Field(description="x, y in px of the summed image; an integer is a pixel's centre.")
+    list[_Px],
+    Field(min_length=2, max_length=2, description="x, y in px of the summed image; an integer is a pixel's centre."),
 ]
 _Kind = Annotated[Text, Field(max_length=LONGEST_KIND, description="Sublattice or element, free text.")]
-_Count = Annotated[int, Field(ge=1, le=100_000)]
-_Spacing = Annotated[float, Field(ge=2, le=_FAR, allow_inf_nan=False)]
+_Count = Annotated[int, Plain, Field(ge=1, le=100_000)]
+_Number = Annotated[int, Plain, Field(ge=0, lt=HIGHEST_ID)]
+_Spacing = Annotated[float, Plain, Field(ge=2, le=_FAR, allow_inf_nan=False)]
 
 
 class EditedColumn(BaseModel):
@@ -43,7 +45,7 @@ class EditedColumn(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    column_id: int | None = Field(None, ge=0, lt=HIGHEST_ID, description="Null: a new one, which gets a new number.")
+    column_id: _Number | None = Field(None, description="Null: a new one, which gets a new number.")
     x: _Px = Field(description="Column of the image, px.")
     y: _Px = Field(description="Row of the image, px.")
     kind: _Kind = ""
@@ -132,7 +134,7 @@ class NewVersion(BaseModel):
 
     columns: _Columns
     note: Annotated[Text, Field(max_length=500)] = ""
-    base: int | None = Field(None, ge=0, lt=HIGHEST_ID, description="The version that these were made from.")
+    base: _Number | None = Field(None, description="The version that these were made from.")
 
 
 class Saved(BaseModel):
@@ -168,7 +170,9 @@ class Refined(BaseModel):
     )
 
     columns: list[FoundColumn]
-    merged: list[tuple[int, int]] = Field(description="A column, and one left out because it fell together with it.")
+    merged: list[Annotated[list[int], Field(min_length=2, max_length=2)]] = Field(
+        description="A column, and one left out because it fell together with it."
+    )
     spacing_px: float
     window_px: int
 
@@ -226,7 +230,7 @@ class Choice(BaseModel):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"version": 1}})
 
-    version: int = Field(ge=0, lt=HIGHEST_ID, description="0: the columns found automatically.")
+    version: _Number = Field(description="0: the columns found automatically.")
 
 
 def _answers(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
@@ -255,7 +259,7 @@ async def list_versions(job_id: JobId, request: Request, scene: OfJob, who: Who)
     return await run_in_threadpool(_versions, request.app.state.store, job_id, first, who)
 
 
-@router.get("/jobs/{job_id}/columns/{version}", responses=_answers(Table))
+@router.get("/jobs/{job_id}/columns/{version:int}", responses=_answers(Table))
 async def read_version(job_id: JobId, version: VersionNumber, request: Request, scene: OfJob) -> Response:
     """Read a version of a job's columns."""
     store: JobStore = request.app.state.store

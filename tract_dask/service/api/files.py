@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ..folders import Entry
 from ..planning import about_movie
-from .models import RelativePath, errors
+from .models import RelativePath, Shape, errors
 
 router = APIRouter(tags=["files"])
 
@@ -74,7 +74,7 @@ class About(BaseModel):
     path: str
     format: str
     files: int = Field(description="How many files hold the frames.")
-    shape: tuple[int, int, int] = Field(description="Frames, rows and columns.")
+    shape: Shape
     dtype: str
     bytes: int = Field(description="Of all frames, uncompressed.")
     pixel_size_pm: float | None = Field(description="Side of a pixel in pm; null: the file does not say.")

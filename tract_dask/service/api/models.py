@@ -6,7 +6,15 @@ import math
 from typing import Annotated, Any, Literal
 
 from fastapi import Path, Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    WithJsonSchema,
+)
 
 from ..jobs.states import State
 from ..problems import ERRORS
@@ -27,6 +35,19 @@ def plain_text(text: str) -> str:
     if any(ord(sign) < 32 or 0x7F <= ord(sign) < 0xA0 or 0xD800 <= ord(sign) < 0xE000 for sign in text):
         raise ValueError("the text has control characters or halves of characters")
     return text
+
+
+def plain_number(value: Any) -> Any:
+    """Return ``value`` if it is neither a text nor a truth value, which would count as numbers otherwise.
+
+    Raises
+    ------
+    ValueError
+        Where it is.
+    """
+    if isinstance(value, str | bool):
+        raise ValueError("a number is needed")
+    return value
 
 
 def plain_values(value: dict[str, Any]) -> dict[str, Any]:
@@ -69,6 +90,10 @@ def _parts(value: Any) -> list[Any]:
 Text = Annotated[
     str, AfterValidator(plain_text), Field(json_schema_extra={"pattern": "^[^\\u0000-\\u001f\\u007f-\\u009f]*$"})
 ]
+Plain = BeforeValidator(plain_number)
+"""Of a number in a body."""
+
+Shape = Annotated[list[int], Field(min_length=3, max_length=3, description="Frames, rows and columns.")]
 Label = Annotated[Text, StringConstraints(max_length=200)]
 RelativePath = Annotated[Text, StringConstraints(max_length=1024)]
 SettingValues = Annotated[
@@ -260,7 +285,9 @@ class NewJob(BaseModel):
     settings: SettingValues = Field(default_factory=dict, description="By group and name; the rest has its default.")
     label: Label = ""
     output: RelativePath = Field("", description="A folder under the data root; empty: one of its own below jobs/.")
-    curate: bool = Field(False, description="Stop after the summed image, for columns to be edited by hand.")
+    curate: bool = Field(
+        False, strict=True, description="Stop after the summed image, for columns to be edited by hand."
+    )
 
 
 class NewLabel(BaseModel):

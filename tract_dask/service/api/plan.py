@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ..planning import plan_job
 from .declarations import setting_rows
-from .models import RelativePath, SettingValues, errors
+from .models import RelativePath, SettingValues, Shape, errors
 
 router = APIRouter(tags=["plan"])
 
@@ -52,7 +52,7 @@ class PlanAnswer(BaseModel):
     )
 
     frames: int
-    shape: tuple[int, int, int] = Field(description="Frames, rows and columns.")
+    shape: Shape
     dtype: str
     shards: int = Field(description="Units of work.")
     bytes_read: int = Field(description="From disk, at most.")

@@ -40,7 +40,7 @@ class Levels(BaseModel):
     )
 
     version: str = Field(description="Another once the image has changed; give it as ``v`` with its pictures.")
-    shape: tuple[int, int] = Field(description="Rows and columns of the whole image, px.")
+    shape: list[int] = Field(min_length=2, max_length=2, description="Rows and columns of the whole image, px.")
     range: list[float] | None = Field(
         min_length=2, max_length=2, description="Smallest and largest value, counts; null: nothing exposed."
     )

@@ -40,10 +40,8 @@ _REPORT_POLICY = "; ".join(
 _DOWNLOAD: dict[int | str, dict[str, Any]] = errors(400, 404, 503) | {
     200: {
         "description": "The file; with ``prepare``, whether it is ready.",
-        "content": {
-            **{kind.partition(";")[0]: {} for kind in exports.FORMATS.values()},
-            "application/json": {"schema": {"$ref": "#/components/schemas/Prepared"}},
-        },
+        "model": Prepared,
+        "content": {kind.partition(";")[0]: {} for kind in exports.FORMATS.values()},
     }
 }
 _PREPARE_S = 1.0

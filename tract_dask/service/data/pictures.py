@@ -116,8 +116,10 @@ def source_png(
 def source_levels(
     path: str, source: SourceSettings, metadata: MetadataSettings, frame: int, view: View, stamp: str
 ) -> bytes:
-    """Return what values a frame has, seen like that; see :func:`levels`."""
-    return as_json(levels(source_plane(path, source, metadata, frame, stamp), view) | {"version": stamp})
+    """Return what values a frame has, seen like that, and the size of its pixels; see :func:`levels`."""
+    found = levels(source_plane(path, source, metadata, frame, stamp), view)
+    opened = _opened_movie(path, stamp) if path.endswith(".zarr") else open_cached(path, source, metadata).metadata
+    return as_json(found | {"pixel_size_pm": opened.pixel_size_pm, "version": stamp})
 
 
 def sum_png(folder: Path, view: View, stamp: str) -> bytes:

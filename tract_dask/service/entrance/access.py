@@ -24,7 +24,7 @@ from starlette.requests import HTTPConnection
 from ...errors import InputError
 from ..config import ServiceConfig
 from ..jobs.store import Job, JobStore
-from ..problems import ForbiddenError, NoTokenError, TooManyError
+from ..refusals import ForbiddenError, NoTokenError, TooManyError
 
 TOKEN_PREFIX = "tract"
 IDENTITY = "tract_dask.identity"

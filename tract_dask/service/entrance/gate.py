@@ -16,7 +16,8 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..config import LOOPBACK, ServiceConfig
-from ..problems import ForbiddenError, NoTokenError, answer
+from ..problems import answer
+from ..refusals import ForbiddenError, NoTokenError
 from .access import IDENTITY, LOCAL, Access, Credential, Identity, Role
 from .headers import host_name
 

@@ -9,7 +9,8 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..config import LOOPBACK
-from ..problems import TooLargeError, answer
+from ..problems import answer
+from ..refusals import TooLargeError
 
 CONTENT_SECURITY_POLICY = "; ".join(
     (

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from ..pages import templates
-from ..problems import TooManyError
+from ..refusals import TooManyError
 from .access import Access, Attempts
 from .gate import LOGIN, cookie_name, read_cookie
 

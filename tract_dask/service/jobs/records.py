@@ -14,6 +14,10 @@ class UnknownJobError(InputError):
     """There is no such job."""
 
 
+class UnknownVersionError(InputError):
+    """There is no such version of a job's columns."""
+
+
 class ConflictError(InputError):
     """The job's state does not allow this."""
 

@@ -8,9 +8,8 @@ import sqlite3
 from collections.abc import Sequence
 from typing import Any
 
-from ...errors import InputError
 from .clock import utc_now
-from .records import ConflictError, Job, JobEvent, UnknownJobError
+from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError
 from .states import ENDED, TRANSITIONS, State
 
 AFRESH: dict[str, Any] = {"ended": None, "not_before": None, "lost_tries": 0, "outcome": {}}
@@ -41,10 +40,10 @@ def read_job(db: sqlite3.Connection, job_id: str) -> Job:
 
 
 def read_columns(db: sqlite3.Connection, job_id: str, version: int) -> str:
-    """Return a version of a job's columns; raise InputError where there is none."""
+    """Return a version of a job's columns; raise UnknownVersionError where there is none."""
     row = db.execute("SELECT csv FROM columns WHERE job_id = ? AND version = ?", (job_id, version)).fetchone()
     if row is None:
-        raise InputError(
+        raise UnknownVersionError(
             "there is no such version of the columns", f"job {job_id}", remedy="See the job's list of versions"
         )
     return str(row["csv"])

@@ -17,11 +17,11 @@ from typing import Any
 
 from . import rows
 from .clock import utc_now
-from .records import ConflictError, Job, JobEvent, UnknownJobError
+from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError
 from .states import CURATABLE, RETRYABLE, State
 from .tables import migrate
 
-__all__ = ["ConflictError", "Job", "JobEvent", "JobStore", "UnknownJobError"]
+__all__ = ["ConflictError", "Job", "JobEvent", "JobStore", "UnknownJobError", "UnknownVersionError"]
 
 BUSY_TIMEOUT_S = 30.0
 KEPT_LINES = 2000
@@ -258,7 +258,7 @@ class JobStore:
         ------
         ConflictError
             Where it is in another state, or another job writes to its folder.
-        InputError
+        UnknownVersionError
             Where there is no such version.
         """
         with self.writing() as db:
@@ -333,7 +333,7 @@ class JobStore:
 
         Raises
         ------
-        InputError
+        UnknownVersionError
             Where there is no such version.
         """
         return rows.read_columns(self.connection(), self.job(job_id).id, version)

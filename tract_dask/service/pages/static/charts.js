@@ -209,7 +209,7 @@ class LineChart {
     const box = { left: axes[0].room, right: width - (axes[1] ? axes[1].room : 10), top: 24, bottom: height - 32 };
     this.toX = (px) => this.bounds[0] + ((px - box.left) / (box.right - box.left)) * (this.bounds[1] - this.bounds[0]);
     const place = { x: (x) => box.left + ((x - this.bounds[0]) / (this.bounds[1] - this.bounds[0])) * (box.right - box.left) };
-    this.paintAxes(pen, box, axes, place, ink, width, height);
+    if (hasData) this.paintAxes(pen, box, axes, place, ink, width, height);
     pen.save();
     pen.beginPath();
     pen.rect(box.left, box.top - 2, box.right - box.left, box.bottom - box.top + 4);
@@ -231,6 +231,7 @@ class LineChart {
     else {
       pen.fillStyle = ink.text;
       pen.textAlign = "center";
+      pen.textBaseline = "middle";
       pen.fillText(this.options.empty, (box.left + box.right) / 2, (box.top + box.bottom) / 2);
     }
     this.canvas.setAttribute("aria-label", this.spoken(hasData));
@@ -238,7 +239,9 @@ class LineChart {
 
   axis(pen, right, height) {
     const range = this.rangeY(right, this.bounds);
-    const { values, step } = ticks(...range, Math.max(2, Math.round((height - 52) / 38)));
+    const wanted = Math.max(2, Math.round((height - 52) / 38));
+    const few = ticks(...range, wanted);
+    const { values, step } = few.values.length > 1 ? few : ticks(...range, 2 * wanted); // one number is no scale
     const texts = values.map((value) => tickText(value, step));
     return { range, values, texts, room: Math.max(28, ...texts.map((text) => pen.measureText(text).width)) + 10 };
   }

@@ -112,7 +112,7 @@ function showFigures(figures) {
 function showAbout() {
   const settings = Object.entries(job.settings).flatMap(([group, values]) => Object.entries(values).filter(([name, value]) => isChanged(group, name, value)).map(([name, value]) => `${name} = ${typeof value === "object" ? JSON.stringify(value) : value}`));
   const rows = [["Owner", job.owner], ["Submitted", fullTime(job.created)], ["Started", job.started ? moment(job.started) : "–"], ["Ended", job.ended ? moment(job.ended) : "–"]];
-  if (job.attempts > 1) rows.push(["Started", several(job.attempts, "time")]);
+  if (job.attempts > 1) rows.push(["Begun", several(job.attempts, "time")]);
   rows.push(["Results in", job.output], ["Columns", job.columns_version === null ? (job.curate ? "stops for you to check them" : "found automatically") : `version ${job.columns_version}`], ["Settings", settings.length ? settings.join(", ") : "all at their defaults"]);
   at("about").replaceChildren(...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
 }

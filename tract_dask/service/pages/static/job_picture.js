@@ -46,7 +46,7 @@ export class JobPicture {
   async load(kind, about, picture, query, title) {
     let levels;
     try { levels = await get(about, query); } catch (error) {
-      if (error.status !== 404) setText(this.hint, error.what || "The picture cannot be shown");
+      if (error.status !== 404 || kind === "frame") setText(this.hint, error.what || "The picture cannot be shown");
       return;
     }
     if (!levels.percentiles || (kind === "frame" && this.shown)) return;
@@ -56,7 +56,7 @@ export class JobPicture {
     const contrast = { low: levels.percentiles["0.5"], high: levels.percentiles["99.5"] };
     if (contrast.low === contrast.high) Object.assign(contrast, { low: levels.range[0], high: levels.range[1] });
     const [height, width] = levels.shape;
-    const address = (box, wide) => url(picture, { ...query, ...contrast, v: levels.version, box: [box.x0 - 0.5, box.y0 - 0.5, box.x1 - 0.5, box.y1 - 0.5].join(), width: wide });
+    const address = (box, wide) => url(picture, { ...query, ...contrast, v: levels.version, box: [box.x0, box.y0, box.x1, box.y1].join(), width: wide });
     const image = { width, height, pixelSizePm: this.pixelSizePm ?? levels.pixel_size_pm };
     if (this.view) {
       this.view.options.url = address;
@@ -138,7 +138,7 @@ export class JobPicture {
 
   clicked(event) {
     const moved = this.down ? Math.hypot(event.clientX - this.down[0], event.clientY - this.down[1]) : Infinity;
-    if (this.values && this.under && moved < CLICK_PX) location.assign(`/jobs/${this.job}/results?column=${this.under.column_id}`);
+    if (this.values && this.under && moved < CLICK_PX) location.assign(`/jobs/${this.job}/results#columns=${this.under.column_id}`);
   }
 }
 

@@ -36,7 +36,7 @@ export function drawColourBar(canvas, scale, label) {
   const pen = canvas.getContext("2d");
   pen.scale(ratio, ratio);
   if (!scale || height < 80) return;
-  const [top, bottom, wide] = [scale.more ? 48 : 34, height - 10, 14];
+  const [top, bottom, wide] = [scale.more ? 54 : 34, height - 10, 14];
   for (let y = top; y < bottom; y += 1) {
     pen.fillStyle = viridis((bottom - y) / (bottom - top));
     pen.fillRect(0, y, wide, 1.5);
@@ -54,5 +54,5 @@ export function drawColourBar(canvas, scale, label) {
     pen.fillRect(wide, y - 0.5, 4, 1);
     pen.fillText(tickText(value, step), wide + 7, y);
   }
-  if (scale.more) pen.fillText("▲ more", 0, top - 9, width);
+  if (scale.more) pen.fillText("▲ more", 0, top - 15, width);
 }
