@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,11 +11,30 @@ import numpy as np
 import pytest
 import xarray as xr
 from hypothesis import settings
+from numba.core.dispatcher import Dispatcher
 
 from tract_dask import schema
 
 settings.register_profile("checks", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("checks")
+
+
+def _untraced(compile_):
+    """Let coverage not follow what Numba does when it compiles, which takes it half as long again."""
+
+    @functools.wraps(compile_)
+    def compile_untraced(*args, **kwargs):
+        tracer = sys.gettrace()
+        sys.settrace(None)
+        try:
+            return compile_(*args, **kwargs)
+        finally:
+            sys.settrace(tracer)
+
+    return compile_untraced
+
+
+Dispatcher.compile = _untraced(Dispatcher.compile)
 
 
 @dataclass

@@ -258,7 +258,7 @@ def test_results_come_whole_or_not_at_all(client, jobs, service, tmp_path):
     assert [path.name for path in (tmp_path / "kept").iterdir()] == [f"{job.id}.zarr"]
     client.open_results(job.id, tmp_path / "kept")  # in place of the older one
     table = client.download(job.id, tmp_path / "tracks.csv")
-    assert len(table.read_text().splitlines()) > fits.values["fit"].shape[0]
+    assert len(table.read_text().splitlines()) > truth["fit"].sizes["frame"]
     for wrong in (tmp_path / "tracks.csv", tmp_path / "tracks.xyz", tmp_path / "none" / "tracks.csv"):
         with pytest.raises(DestinationError):
             client.download(job.id, wrong)

@@ -1,5 +1,6 @@
-"""The service as a new user meets it: every page in a browser, and what is downloaded at the end against the truth."""
+"""The service from outside: as a new user meets it in a browser, and as many at once do."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 from tract_dask.simulate import simulate_movie
 
-WALK = Path(__file__).parents[1] / "scripts" / "service_walk"
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 
 @pytest.mark.slow
@@ -22,7 +23,20 @@ def test_a_new_user_goes_from_a_movie_to_a_dataset(tmp_path):
         n_ce=truth["atoms"],
     )
     walked = subprocess.run(
-        [sys.executable, WALK, tmp_path / "movie.tif", tmp_path / "walk"], capture_output=True, text=True, timeout=540
+        [sys.executable, SCRIPTS / "service_walk", tmp_path / "movie.tif", tmp_path / "walk"],
+        capture_output=True,
+        text=True,
+        timeout=540,
     )
     assert walked.returncode == 0, walked.stdout + walked.stderr
     assert "below 3.5 pm" in walked.stdout  # it did compare with the truth
+
+
+def test_the_load_test_measures_a_service(tmp_path):
+    options = ["--minutes", "0.2", "--jobs", "2", "--watchers", "2", "--rate", "8", "--folder", str(tmp_path)]
+    loaded = subprocess.run(
+        [sys.executable, SCRIPTS / "service_load_test", *options], capture_output=True, text=True, timeout=170
+    )
+    assert re.search(r"^all +\d+( +\d+\.\d){4}$", loaded.stdout, re.MULTILINE), loaded.stdout + loaded.stderr
+    assert re.search(r"^events, on their way +[1-9]\d*( +\d+\.\d){4}$", loaded.stdout, re.MULTILINE), loaded.stdout
+    assert "Traceback" not in loaded.stderr  # its exit code is of the times, which mean nothing here

@@ -140,7 +140,7 @@ def columns_stage(
     began = perf_counter()
     on_event(StageStarted("columns", 0))
     if same and edited:
-        on_event(Warned(f"{csv.name} was edited by hand: your columns are kept, and refined on the summed image"))
+        on_event(Warned(f"{csv.name} was edited: your columns are kept, and refined on the summed image"))
         found = find(dataclasses.replace(settings, method="csv", csv=str(csv)))
     else:
         found = _reopened(store) if same else find(settings)

@@ -118,7 +118,8 @@ def _place(loc: Sequence[Any]) -> Sequence[Any]:
 
 def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    problem = TractError(str(error.detail), f"{request.method} {request.url.path}")
+    what = "there is nothing here" if error.status_code == HTTPStatus.NOT_FOUND else str(error.detail)
+    problem = TractError(what, f"{request.method} {request.url.path}")
     headers = dict(error.headers or {})
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED and (methods := _methods(request)):
         headers["Allow"] = ", ".join(methods)  # the framework names those of one route only
