@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Scene
+from playwright import sync_api as playwright
 from serviced import listening, make_root
 
 from tract_dask.progress import REPORT, STAGES
 from tract_dask.service.jobs.states import State
 from tract_dask.settings import ClusterSettings
 
-playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = Path("/usr/bin/chromium")
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs chromium")
 
 THEMES = ("light", "dark")
 PATIENCE_MS = 15_000

@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from playwright import sync_api
 from serviced import listening
 from test_service_results import N_COLUMNS, Fits
 
 from tract_dask import open_results, results, stores
 
-sync_api = pytest.importorskip("playwright.sync_api")
-
 expect = sync_api.expect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 
 SHAPE = (90, 100)
 WAIT_MS = 30_000
