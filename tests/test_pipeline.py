@@ -151,7 +151,7 @@ def test_edited_columns_are_kept_and_fitted_anew(done, scene):
     edited = file.read_text()
     second = done()
     assert done.worked == {"columns", "fit"}
-    assert any("edited by hand" in event.message for event in done.of(Warned))
+    assert any("was edited" in event.message for event in done.of(Warned))
     assert second.columns == len(scene.place) - 1
     assert file.read_text() == edited
     assert done().reused == STAGES
