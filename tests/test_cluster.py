@@ -69,6 +69,31 @@ def test_forked_workers_have_everything_imported_and_the_driver_keeps_its_enviro
     assert {"tract_dask.conversion", "tract_dask.drift", "tract_dask.fit"} <= modules
 
 
+OPEN_THE_DASHBOARD = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from urllib.request import urlopen
+
+from tract_dask import cluster
+from tract_dask.settings import ClusterSettings
+
+if __name__ == "__main__":
+    with cluster.connect(ClusterSettings(workers=1)) as client:
+        assert "bokeh" not in sys.modules
+        with ThreadPoolExecutor(3) as several:
+            pages = list(several.map(lambda _: urlopen(client.dashboard_link, timeout=60), range(3)))
+        assert {page.url for page in pages} == {client.dashboard_link}
+        print(*[page.read().decode().count("<title>Dask Diagnostic UI</title>") for page in pages])
+"""
+
+
+def test_the_dashboard_is_loaded_when_it_is_opened(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(OPEN_THE_DASHBOARD)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.split() == ["1", "1", "1"], done.stderr
+
+
 @pytest.mark.skipif(not forkserver.AVAILABLE, reason="workers are spawned here")
 def test_what_the_fork_server_imports_starts_no_thread():
     """A thread would not live on in the workers, but what it holds locked would stay so."""
@@ -293,7 +318,7 @@ def test_keeper_starts_a_killed_cluster_again_and_leaves_nothing_behind(tmp_path
         assert (worker["memory_limit"], worker["executing"], worker["stage"]) == (700_000_000, 0, "")
         assert keeper.dashboard().startswith("http://127.0.0.1:")
         holder = next(
-            child for child in psutil.Process().children() if "tract_dask.service.running.keeper" in child.cmdline()
+            child for child in psutil.Process().children() if "tract_dask.service.running.holder" in child.cmdline()
         )
         before = [holder, *children(holder.pid)]
         holder.kill()
@@ -303,7 +328,7 @@ def test_keeper_starts_a_killed_cluster_again_and_leaves_nothing_behind(tmp_path
         with cluster.connect(found) as client:
             assert client.submit(sum, [1, 2]).result() == 3
         holder = next(
-            child for child in psutil.Process().children() if "tract_dask.service.running.keeper" in child.cmdline()
+            child for child in psutil.Process().children() if "tract_dask.service.running.holder" in child.cmdline()
         )
         after = [holder, *children(holder.pid)]
     finally:

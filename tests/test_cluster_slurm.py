@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import time
 
+import dask
 import numpy as np
 import pytest
 import xarray as xr
@@ -80,6 +81,16 @@ def test_cancelled_job_is_followed_by_another_and_the_run_ends_as_if_nothing_had
     xr.testing.assert_identical(
         open_results(hurt.outputs.results).load().drop_attrs(), open_results(whole.outputs.results).load().drop_attrs()
     )
+
+
+def test_a_place_that_dask_has_given_up_is_filled_again(settings, monkeypatch):
+    monkeypatch.setattr(slurm, "_LOOK_S", 3.0)  # so that Dask notices first that the worker has gone
+    lost_at_once = dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"})
+    with lost_at_once, cluster.hold(settings) as held, held.get_client() as client:
+        wait_for(client.nthreads, 60.0)
+        cancelled = jobs()
+        subprocess.run(["scancel", *cancelled], check=True)
+        wait_for(lambda: len(jobs()) == 1 and jobs() != cancelled, 60.0)
 
 
 def test_jobs_come_with_clients_and_go_after_them(settings, monkeypatch):

@@ -54,8 +54,10 @@ ALLOWED = {
     "slurm": {"errors", "forkserver", "settings", "tls"},
     "supervision": set(),
     "ssh": {"errors", "forkserver", "settings", "supervision", "tls"},
-    "cluster": {"errors", "settings", "forkserver", "shards", "slurm", "ssh", "tls"},
+    "dask_dashboard": set(),
+    "cluster": {"dask_dashboard", "errors", "settings", "forkserver", "shards", "slurm", "ssh", "tls"},
     "forkserver": set(),
+    "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
     "report": MOVIE | {"analysis", "plots", "results", "windows"},
     "pipeline": STAGES | {"cluster", "report", "stages"},
@@ -66,15 +68,16 @@ ALLOWED = {
     "console": {"options"},
     "certificates": {"errors"},
     "service": RUN
-    | {"analysis", "certificates", "describe", "export", "forkserver", "meter", "report", "supervision", "terminal"},
+    | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
+    | {"meter", "report", "supervision", "terminal"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
-    "hosting": {"certificates", "console", "options", "service", "settings"},
+    "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},
     "meter": {"progress"},
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "options", "remote", "report", "simulate", "terminal"},
+    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

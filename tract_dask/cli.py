@@ -24,6 +24,7 @@ import click
 from .console import DEBUG, PATH, Subgroup, common_options, show
 from .errors import TractError
 from .hosting import certs, serve, token
+from .lazy import uncollected
 from .options import Command, class_options, numbers, setting_options
 from .progress import STAGES
 from .remote import cancel, jobs, submit, watch
@@ -439,8 +440,8 @@ def _pipeline(settings: RunSettings) -> ModuleType:
 
     if not (settings.cluster.scheduler or settings.cluster.scheduler_file):
         forkserver.start()
-    from . import pipeline
-
+    with uncollected():
+        from . import pipeline
     return pipeline
 
 

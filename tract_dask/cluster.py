@@ -18,7 +18,7 @@ from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 from distributed.system import MEMORY_LIMIT
 
-from . import forkserver
+from . import dask_dashboard, forkserver
 from .errors import ClusterError, SettingsError
 from .settings import ClusterSettings
 from .shards import PATIENCE, patience_s
@@ -238,6 +238,7 @@ def _hold_local(settings: ClusterSettings) -> Iterator[LocalCluster]:
                 security=security(settings.tls),
                 local_directory=settings.local_directory,
                 dashboard_address="127.0.0.1:8787",
+                scheduler_kwargs=dask_dashboard.LATER,
                 silence_logs=logging.CRITICAL,
             )
         except RuntimeError as error:
@@ -250,6 +251,7 @@ def _hold_local(settings: ClusterSettings) -> Iterator[LocalCluster]:
                 "otherwise look at what the workers wrote above, and whether the memory limit is too small",
             ) from error
         with cluster:
+            dask_dashboard.open_on_request(cluster)
             yield cluster
 
 

@@ -8,7 +8,6 @@ from functools import partial
 from itertools import product
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -178,6 +177,8 @@ class SummedFrames(Movie):
     @property
     def frames(self) -> xr.DataArray:
         """The sums as a lazy array (t, y, x) with coordinates, one Dask chunk a shard."""
+        import dask.array as da  # takes its time, and workers do not need it
+
         shards = {shard.index: shard for shard in self.shards}
 
         def read(index: NDArray[np.int64]) -> Frames:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -72,6 +71,8 @@ def filter_frames(movie: Movie, name: str = "gaussian", **parameters: float) -> 
     SettingsError
         Where there is no such filter or parameter, or it is out of range.
     """
+    import dask.array as da  # takes its time, and workers do not need it
+
     settings = from_dict(FitSettings, {"filter": name, **parameters}, "filter_frames")
     frames = movie.frames
     pixels = frames.data.rechunk((1, -1, -1))

@@ -8,7 +8,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from distributed import Client
@@ -74,6 +73,8 @@ def fit_columns(
     SettingsError
         Where a window is larger than the frame, the vacuum box leaves it, or counts (``poisson``) are negative.
     """
+    import dask.array as da  # takes its time, and workers do not need it
+
     job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed, refine_columns=refine_columns)
     n_columns = len(job.reference)
     names = [name for name in schema.RESULTS if name not in ("time", "drift_measured")]

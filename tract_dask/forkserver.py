@@ -39,7 +39,7 @@ should not be forked.
 Dask's own limit for that, 64 KiB, makes the system clear the pages of every buffer anew: as much work as decoding.
 """
 
-_PRELOAD = ["distributed", f"{__package__}.stages"]
+_PRELOAD = [f"{__package__}.preload"]
 
 
 def start() -> None:

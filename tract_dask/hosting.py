@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from .console import PATH, Subgroup, common_options, debug_option, show
+from .lazy import uncollected
 from .options import setting_options
 from .settings import RunSettings
 
@@ -41,8 +42,9 @@ def serve(settings: RunSettings, **options: Any) -> None:
     It keeps its own store in the folder .tract_dask of the data root. Stop it, or lose the machine: started again, it
     goes on with every job.
     """
-    from .service import serving
-    from .service.config import ServiceConfig
+    with uncollected():
+        from .service import serving
+        from .service.config import ServiceConfig
 
     serving.serve(ServiceConfig(cluster=settings.cluster, **options), click.echo)
 

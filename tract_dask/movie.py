@@ -11,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -193,6 +192,8 @@ class Movie:
     @property
     def frames(self) -> xr.DataArray:
         """The frames as a lazy array (t, y, x) with coordinates, one Dask chunk a shard."""
+        import dask.array as da  # takes its time, and workers do not need it
+
         pixels = da.from_array(
             _LazyFrames(self),
             chunks=(self.frames_per_shard, *self.shape[1:]),

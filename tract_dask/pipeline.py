@@ -493,10 +493,10 @@ class _Record:
 def _get_ready() -> None:
     """Import what the later stages need here, and make the compiler ready to load kernels."""
     from . import columns, report  # noqa: F401
-    from .kernels.registration import clean_image
+    from .kernels.registration import load_kernels
     from .plots import plot_columns  # noqa: F401
 
-    clean_image(np.zeros((8, 8), np.float32))
+    load_kernels()
 
 
 def _open(source: str | Path, settings: RunSettings) -> FrameSource:

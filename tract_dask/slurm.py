@@ -23,6 +23,9 @@ NANNY_BYTES = 256_000_000
 """What a job needs for each worker beside the worker's own memory: the process that watches it."""
 
 _LOOK_S = 2.0
+_CORRECT_S = 120.0
+"""For so long jobs may be cancelled and queued until it is given up, and tried again."""
+
 _IDLE_S = 60.0
 """For so long the workers beyond the fewest are kept when the last client has gone."""
 
@@ -93,19 +96,23 @@ def _arguments(settings: ClusterSettings, memory_limit: int) -> dict[str, Any]:
 
 
 def _keep(cluster: Any, settings: ClusterSettings, ended: Event) -> None:
-    """Replace jobs that have ended, and follow what is wanted, until the end; what fails is tried again."""
+    """Replace jobs that have ended, and follow what is wanted, until the end.
+
+    Whatever fails is tried again: without this thread, no job would follow another.
+    """
     most, per_job = int(settings.workers or 1), settings.slurm.workers_per_job
     fewest = most if settings.min_workers is None else settings.min_workers
     busy_at = -_IDLE_S
     while not ended.is_set():
-        if cluster.sync(partial(_has_clients, cluster)):
-            busy_at = monotonic()
-        wanted = most if monotonic() - busy_at < _IDLE_S else fewest
         try:
+            if cluster.sync(partial(_has_clients, cluster)):
+                busy_at = monotonic()
+            wanted = most if monotonic() - busy_at < _IDLE_S else fewest
             ended_jobs = _ended_jobs({job.job_id for job in list(cluster.workers.values())} - {None})
-            cluster.sync(partial(_correct, cluster, ceil(wanted / per_job), ended_jobs))
-        except ClusterError as error:
-            _log.warning("%s", error)
+            correct = partial(_correct, cluster, ceil(wanted / per_job), ended_jobs)
+            cluster.sync(correct, callback_timeout=_CORRECT_S)
+        except Exception as error:  # noqa: BLE001  of a command, or of the classes that call them
+            _log.warning("SLURM jobs could not be looked after: %s", str(error) or repr(error))
         ended.wait(_LOOK_S)
 
 
@@ -114,13 +121,18 @@ async def _has_clients(cluster: Any) -> bool:
 
 
 async def _correct(cluster: Any, jobs: int, ended_jobs: set[str]) -> None:
-    """Forget the jobs that have ended, and ask for as many as are wanted."""
+    """Forget the jobs that have ended, and ask for as many as are wanted.
+
+    The cluster itself cancels the job of a worker that it has not heard of for some time, and leaves its place empty
+    until it is awaited.
+    """
     lost = [name for name, job in cluster.workers.items() if job.job_id is None or job.job_id in ended_jobs]
     if lost:  # without a number: sbatch has refused it
         _log.warning("SLURM jobs have ended: %s", ", ".join(str(cluster.workers[name].job_id) for name in lost))
         await cluster.scale_down([name for name in lost if name in cluster.worker_spec])
     if len(cluster.worker_spec) != jobs:
         cluster.scale(jobs=jobs)
+    await cluster
 
 
 def lifetime_s(walltime: str) -> int:

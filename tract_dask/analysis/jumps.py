@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
@@ -10,7 +11,7 @@ import dask
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy.special import gammainccinv, gammaincinv
 
 from .. import schema
 from ..errors import SettingsError
@@ -25,7 +26,7 @@ _PARTS = 64
 """A block is worked through in so many parts, side by side."""
 _CUT = 2.5
 """First differences beyond so many standard deviations are jumps, and do not count in the noise."""
-_CUT_VARIANCE = 1 - 2 * _CUT * stats.norm.pdf(_CUT) / (2 * stats.norm.cdf(_CUT) - 1)
+_CUT_VARIANCE = 1 - math.sqrt(2 / math.pi) * _CUT * math.exp(-(_CUT**2) / 2) / math.erf(_CUT / math.sqrt(2))
 """Variance of a standard normal variable that is cut there."""
 _CORRELATED = 2.05
 """So many differences tell as much of the noise as one normal variable: neighbours share a frame, and they are cut.
@@ -226,8 +227,7 @@ def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -
     watched = (positions(tracks).notnull().all("axis").sum("frame") - 1).clip(min=0).compute() * frame_time
     time = watched.where(watched > 0).to_numpy()
     tail = (1 - confidence) / 2
-    low = np.where(n > 0, stats.chi2.ppf(tail, 2 * np.maximum(n, 1)) / 2, 0.0)
-    high = stats.chi2.isf(tail, 2 * n + 2) / 2
+    low, high = np.where(n > 0, gammaincinv(np.maximum(n, 1), tail), 0.0), gammainccinv(n + 1, tail)
     found = {
         "rate": (n / time, "1/s", "Jumps for each second"),
         "low": (low / time, "1/s", f"Lower end of the {confidence:.0%} interval of the rate"),
@@ -308,7 +308,9 @@ def _penalty(confidence: float, n: int) -> float:
     def excess(gain: float) -> float:
         return float(np.log(chance(gain, n)) - np.log1p(-confidence))
 
-    return 2.0 if excess(4.0) <= 0 else float(optimize.brentq(excess, 4.0, most))
+    from scipy.optimize import brentq  # takes its time, and a report of a run does not need it
+
+    return 2.0 if excess(4.0) <= 0 else float(brentq(excess, 4.0, most))
 
 
 def _jumps_of(

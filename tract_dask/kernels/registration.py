@@ -163,6 +163,11 @@ def correlation(frame: Image, template: Image, shift: Sequence[int] | NDArray[np
     return float(np.vdot(t, f)) / power**0.5 if power > 0.0 else 0.0
 
 
+def load_kernels() -> None:
+    """Load a kernel: Numba sets itself up at the first, which takes a second, and loads others in milliseconds."""
+    clean_image(np.zeros((8, 8), np.float32))
+
+
 @njit(cache=True, nogil=True)
 def clean_image(raw: NDArray[Any]) -> tuple[Image, bool]:
     """Return a frame in float32, its NaN and infinite pixels replaced by its mean, and whether it shows anything."""

@@ -1,8 +1,8 @@
 """The cluster that all jobs share: a process of its own that holds it, and what can be seen of its workers.
 
 The service and every job's process are clients of that cluster, and find it by a scheduler file. The process that holds
-it ends when its standard input does, so that a killed service leaves nothing behind; where it dies itself, it is
-started again. A cluster that somebody else runs (kind address) needs no process, and is only looked at.
+it (:mod:`.holder`) ends when its standard input does, so that a killed service leaves nothing behind; where it dies
+itself, it is started again. A cluster that somebody else runs (kind address) needs no process, and is only looked at.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import signal
 import sys
 from contextlib import suppress
 from functools import partial
@@ -23,14 +22,15 @@ from urllib.parse import urlsplit
 from distributed.core import rpc
 from distributed.utils import key_split
 
-from ...cluster import hold, scheduler_address
-from ...errors import ClusterError, TractError
-from ...settings import ClusterSettings, from_dict, to_dict
+from ...cluster import scheduler_address
+from ...errors import ClusterError
+from ...settings import ClusterSettings, to_dict
 from ...supervision import Supervised
 from ...tls import checked_address, security, web_context
 
 _log = logging.getLogger(__name__)
 
+_HOLDER = f"{__package__}.holder"
 _LOOK_S = 1.0
 _ANSWER_S = 5.0
 _STALE_S = 5.0
@@ -63,7 +63,7 @@ class Keeper:
         if self._is_ours:
             order = {"settings": to_dict(self._settings), "file": str(self._file.absolute())}
             forget = partial(self._file.unlink, missing_ok=True)
-            self._holder = Supervised("the cluster", [sys.executable, "-m", __name__], f"{json.dumps(order)}\n", forget)
+            self._holder = Supervised("the cluster", [sys.executable, "-m", _HOLDER], f"{json.dumps(order)}\n", forget)
         self._looking = Thread(target=self._look, name="keeper", daemon=True)
         self._looking.start()
 
@@ -178,24 +178,3 @@ def _worker(address: str, about: dict[str, Any], tasks: Any) -> dict[str, Any]:
         "executing": int(metrics.get("task_counts", {}).get("executing", 0)),
         "stage": next((key_split(key) for key in tasks), ""),
     }
-
-
-def main() -> None:
-    """Hold the cluster that the first line of standard input describes, until standard input ends."""
-    signal.signal(signal.SIGTERM, lambda *about: sys.exit())  # in good order: SLURM's jobs have to be cancelled
-    order = json.loads(sys.stdin.readline())
-    settings, file = from_dict(ClusterSettings, order["settings"]), Path(order["file"])
-    with hold(settings) as cluster:
-        about = {"type": "Scheduler", "address": cluster.scheduler_address, "dashboard": cluster.dashboard_link}
-        aside = file.with_name(f".{file.name}.part")
-        aside.write_text(json.dumps(about), encoding="utf-8")
-        aside.replace(file)
-        while sys.stdin.readline():
-            pass
-
-
-if __name__ == "__main__":
-    try:
-        main()
-    except TractError as failure:
-        sys.exit(str(failure))

@@ -15,6 +15,8 @@ import threading
 from queue import SimpleQueue
 from typing import Any
 
+from ...lazy import uncollected
+
 
 def main() -> int:
     """Do the order on standard input; return the exit code."""
@@ -23,8 +25,8 @@ def main() -> int:
     orders: SimpleQueue[dict[str, Any]] = SimpleQueue()
     threading.Thread(target=_listen, args=(threading.get_ident(), orders), daemon=True).start()
     try:
-        from .orders import carry_out
-
+        with uncollected():
+            from .orders import carry_out
         return carry_out(orders.get(), stream)
     except KeyboardInterrupt:  # before the work had begun
         return 130
