@@ -59,7 +59,8 @@ ALLOWED = {
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
-    "report": MOVIE | {"analysis", "plots", "results", "windows"},
+    "web": set(),
+    "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
     "pipeline": STAGES | {"cluster", "report", "stages"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
@@ -69,7 +70,7 @@ ALLOWED = {
     "certificates": {"errors"},
     "service": RUN
     | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
-    | {"meter", "report", "supervision", "terminal"},
+    | {"meter", "report", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},

@@ -2,26 +2,33 @@
 
 import base64
 import dataclasses
-import gzip
+import json
 import re
+from contextlib import contextmanager
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 import xarray as xr
 from conftest import Scene
+from matplotlib import colormaps
+from playwright import sync_api as playwright
 
 from tract_dask import results, schema, stores
 from tract_dask.errors import StoreError
 from tract_dask.report import is_current, page, write_report
 from tract_dask.report.findings import findings
-from tract_dask.report.interactive import quantised
+from tract_dask.report.interactive import quantised, script_json
 from tract_dask.report.survey import column_series, survey
 from tract_dask.schema import Status
+from tract_dask.service.api.results import _REPORT_POLICY
 from tract_dask.settings import FitSettings, RunSettings, to_toml
 from tract_dask.shards import Shard
 
 N_FRAMES, ERROR_PX, PIXEL_PM = 40, 0.5, 4.0
+CHROMIUM = "/usr/bin/chromium"
+WAIT_MS = 15_000
+KIND = "Ce</script><!--<b>&"
 VOID = {"meta", "link", "img", "br", "hr", "input"}
 
 
@@ -117,6 +124,8 @@ def written(tmp_path_factory):
     """A run with a weak column and a changed setting, and its page."""
     made = Run(tmp_path_factory.mktemp("run"))
     made.values["status"][: N_FRAMES * 3 // 4, 2] = Status.BELOW_NOISE
+    made.values["r_squared"][:, 2] = 0.6
+    made.columns["kind"][1] = KIND
     made.settings = RunSettings(fit=FitSettings(threshold=2.5))
     return made, write_report(made.write()).read_text(encoding="utf-8")
 
@@ -167,7 +176,8 @@ def test_numbers_of_columns_are_those_of_the_dataset(written):
     np.testing.assert_allclose(found["share"][2], 0.25)
     np.testing.assert_array_equal(np.delete(found["share"].to_numpy(), 2), 1.0)
     np.testing.assert_allclose(found["expected"], ERROR_PX * PIXEL_PM)
-    np.testing.assert_allclose(found["r_squared"], 0.8, rtol=1e-6)
+    np.testing.assert_allclose(found["r_squared"][2], 0.6, rtol=1e-6)
+    np.testing.assert_allclose(np.delete(found["r_squared"].to_numpy(), 2), 0.8, rtol=1e-6)
     assert int(found["below_noise"][2]) == N_FRAMES * 3 // 4
     assert float(found["residual"].max()) < 0.02  # the scene is Gaussians; what their neighbours add, and the blur
 
@@ -292,17 +302,298 @@ def test_packed_numbers_are_the_numbers():
     np.testing.assert_allclose(back[3], 2.5)
 
 
-def test_series_on_the_page_are_those_of_the_dataset(written):
+def page_data(text: str) -> dict:
+    """What the page's scripts are given."""
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def unpacked(packed: dict[str, str]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["base64"]), np.dtype(packed["dtype"]).newbyteorder("<"))
+
+
+def trusted(made: Run) -> xr.Dataset:
+    return results.accepted(results.open_results(made.folder / "results.zarr")).load()
+
+
+def in_time(made: Run, quantity: str) -> np.ndarray:
+    """What the report shows of every column (column, frame): places from that in the summed image, pm; counts."""
+    tracks = trusted(made)
+    if quantity == "intensity":
+        return tracks["intensity"].to_numpy().T
+    place = tracks["fit"].sel(parameter=quantity) - made.columns[f"{quantity}_ref"].to_numpy()
+    return PIXEL_PM * place.to_numpy().T
+
+
+@pytest.mark.parametrize("quantity", ["x", "y", "intensity"])
+def test_series_on_the_page_are_those_of_the_dataset(written, quantity):
     made, text = written
-    found = re.search(
-        r'"x_mean",\{"type":"ndarray","array":\{"type":"bytes","data":"([^"]+)"\},"shape":\[(\d+)\]', text
-    )
-    packed = base64.b64decode(found[1])
-    numbers = np.frombuffer(gzip.decompress(packed) if packed[:2] == b"\x1f\x8b" else packed, np.int16)
-    expected, _, _ = quantised(
-        survey(made.folder, []).series["mean"].sel(quantity="x").transpose("column_id", "bin").to_numpy()
-    )
-    np.testing.assert_array_equal(numbers, expected)
+    own = page_data(text)["series"][quantity]["mean"]
+    numbers, zero, step = (unpacked(own[name]) for name in ("numbers", "zero", "step"))
+    expected = in_time(made, quantity)
+    shown = np.where(numbers == -32768, np.nan, zero.repeat(N_FRAMES) + step.repeat(N_FRAMES) * numbers)
+    np.testing.assert_array_equal(np.isnan(shown), np.isnan(expected.ravel()))
+    assert np.nanmax(np.abs(shown - expected.ravel()) / step.repeat(N_FRAMES)) <= 0.51
+    np.testing.assert_allclose(unpacked(page_data(text)["series"]["time"]), 0.1 * np.arange(N_FRAMES), atol=1e-9)
+
+
+def test_no_text_of_a_run_ends_a_script(written):
+    made, text = written
+    assert page_data(text)["kinds"] == [str(kind) for kind in made.columns["kind"].to_numpy()]
+    assert KIND not in text
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        script_json({"spread": float("nan")})
+
+
+def test_page_is_small_and_has_no_library(written):
+    made, _ = written
+    text = write_report(made.folder, made.folder / "small.html", figures=False).read_text(encoding="utf-8")
+    assert "bokeh" not in text.lower()
+    assert len(text) < 250_000
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def opened(chromium, address, theme="light", policy=""):
+    """The page, which has to end without a complaint of the browser, and to ask for nothing beside itself."""
+    context = chromium.new_context(color_scheme=theme, viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(WAIT_MS)
+    shown, said, asked = context.new_page(), [], []
+    shown.on("console", lambda message: said.append(message.text))
+    shown.on("pageerror", lambda error: said.append(str(error)))
+    shown.on("request", lambda request: request.url.startswith(("data:", "blob:")) or asked.append(request.url))
+    if policy:
+        file, address = address, "http://report.test/"
+        headers = {"Content-Security-Policy": policy, "Content-Type": "text/html; charset=utf-8"}
+        context.route(address, lambda route: route.fulfill(path=file, headers=headers))
+    try:
+        shown.goto(address)
+        shown.wait_for_selector("#map canvas.overlay")
+        yield shown
+        assert said == []
+        assert asked == [address]
+    finally:
+        context.close()
+
+
+@pytest.fixture
+def shown(chromium, written):
+    with opened(chromium, f"file://{written[0].folder / 'report.html'}") as page:
+        yield page
+
+
+def on_map(page, made: Run, index: int) -> tuple[float, float]:
+    """The place of a column in the map, CSS px: the image fits into it, with four px around."""
+    (ny, nx), box = made.scene.shape, page.locator("#map").bounding_box()
+    scale = min((box["width"] - 8) / nx, (box["height"] - 8) / ny)
+    away = made.scene.place[index] - (np.array([nx, ny]) - 1) / 2
+    return tuple(np.array([box["width"], box["height"]]) / 2 + scale * away)
+
+
+def click_column(page, made: Run, index: int) -> None:
+    x, y = on_map(page, made, index)
+    page.click("#map", position={"x": x, "y": y})
+
+
+def settle(page) -> None:
+    """Wait until everything is drawn."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def walk(page, chart: str, steps: int) -> list[list[str]]:
+    """What the chart tells of its points one after the other, as somebody hears who has but a keyboard."""
+    page.focus(f"#{chart} canvas")
+    page.keyboard.press("Home")
+    told = []
+    for _ in range(steps):
+        settle(page)
+        told.append(page.locator(f"#{chart} .chart-legend b").all_text_contents())
+        page.keyboard.press("ArrowRight")
+    return told
+
+
+def number(text: str) -> float:
+    found = re.match(r"-?[\d,.]+(e-?\d+)?", text)
+    return float(found[0].replace(",", "")) if found else np.nan
+
+
+def chosen(page) -> str:
+    return page.locator("#chosen").text_content()
+
+
+@pytest.mark.parametrize("quantity", ["x", "y", "intensity"])
+def test_a_click_on_a_column_shows_the_values_of_the_dataset(shown, written, quantity):
+    made, _ = written
+    click_column(shown, made, 2)
+    assert chosen(shown) == "3 (Ce)"
+    assert shown.locator("#column").input_value() == "2"
+    told = np.array([number(one) for (one,) in walk(shown, quantity, N_FRAMES)])
+    expected = in_time(made, quantity)[2]
+    assert np.isnan(told).sum() == N_FRAMES * 3 // 4  # gaps, where no fit is accepted
+    np.testing.assert_allclose(told, expected, rtol=6e-4, atol=np.nanmax(np.abs(expected)) / 30_000)
+
+
+def test_the_whole_series_is_in_the_charts_description(shown, written):
+    made, _ = written
+    click_column(shown, made, 4)
+    settle(shown)
+    label = shown.locator("#x canvas").get_attribute("aria-label")
+    x = in_time(made, "x")[4]
+    low, high = re.fullmatch(r"x of column 5 in time: x \(pm\) from (\S+) to (\S+)", label).groups()
+    np.testing.assert_allclose([float(low), float(high)], [x.min(), x.max()], rtol=6e-4)
+
+
+def test_columns_are_coloured_by_the_number_that_is_asked_for(shown, written):
+    made, _ = written
+    columns = survey(made.folder, []).columns
+    colours = {}
+    for name in ("spread", "share"):
+        shown.select_option("#shade", name)
+        settle(shown)
+        values = columns[name].to_numpy() * (100 if name == "share" else 1)
+        label = shown.locator("#colour-bar").get_attribute("aria-label")
+        low, high = (float(text) for text in re.search(r"from (\S+) to (\S+)$", label).groups())
+        assert low == pytest.approx(values.min())
+        assert high == pytest.approx(np.sort(values)[int(np.ceil(0.95 * (len(values) - 1)))])
+        for index in (0, 2, 7):
+            share = (values[index] - low) / (high - low) if high > low else 0.5
+            colours[name, index] = pixel(shown, *on_map(shown, made, index))
+            np.testing.assert_allclose(colours[name, index], 255 * np.array(colormaps["viridis"](share)[:3]), atol=12)
+    assert colours["spread", 0] != colours["share", 0]
+
+
+def pixel(page, x: float, y: float) -> list[int]:
+    """The colour that is drawn over the image there."""
+    read = """([x, y]) => {
+        const pen = new OffscreenCanvas(1, 1).getContext("2d"), from = document.querySelector("#map canvas.overlay");
+        pen.drawImage(from, -Math.round(x * devicePixelRatio), -Math.round(y * devicePixelRatio));
+        return [...pen.getImageData(0, 0, 1, 1).data].slice(0, 3);
+    }"""
+    return page.evaluate(read, [x, y])
+
+
+def test_the_pointer_is_told_what_a_column_measures(shown, written):
+    made, _ = written
+    x, y = on_map(shown, made, 1)
+    shown.hover("#map", position={"x": x, "y": y})
+    told = shown.locator("#tip").inner_text().splitlines()
+    own = survey(made.folder, []).columns.isel(column_id=1)
+    assert told[0] == f"Column 2 {KIND}"
+    assert told[1] == f"x {float(own['x_ref']):.2f}, y {float(own['y_ref']):.2f} px"
+    assert number(told[2].removeprefix("spread ")) == pytest.approx(float(own["spread"]), rel=6e-3)
+    assert told[4] == "accepted 100 %"
+
+
+def test_a_dot_is_told_and_chooses_its_column(shown, written):
+    made, _ = written
+    columns = survey(made.folder, []).columns
+    order = np.lexsort([columns["spread"], columns["expected"]])
+    told = walk(shown, "spread", len(order))
+    pattern = r"stated error (\S+) pm, spread (\S+) pm"
+    values = np.array([re.fullmatch(pattern, one).groups() for (one,) in told], float)
+    np.testing.assert_allclose(values[:, 0], columns["expected"][order], rtol=6e-3)
+    np.testing.assert_allclose(values[:, 1], columns["spread"][order], rtol=6e-3)
+    shown.keyboard.press("Enter")
+    assert chosen(shown).split()[0] == str(int(columns["column_id"][order[-1]]))
+    settle(shown)
+    assert shown.locator("#share .chart-legend b").text_content() == "accepted 100 %, R² 0.8"
+
+
+def test_a_click_on_a_dot_chooses_its_column(shown):
+    canvas = shown.locator("#share canvas")
+    low = canvas.bounding_box()["height"] - 32 - 0.06 / 1.12 * (canvas.bounding_box()["height"] - 56)
+    for x in range(30, 120, 4):  # the weak column is at the lower left, beyond the axis' numbers
+        canvas.hover(position={"x": x, "y": low})
+        settle(shown)
+        if "accepted 25 %" in shown.locator("#share .chart-legend").text_content():
+            break
+    canvas.click(position={"x": x, "y": low})
+    assert chosen(shown) == "3 (Ce)"
+
+
+def test_curves_over_the_frames_are_those_of_the_dataset(shown, written):
+    made, _ = written
+    told = np.array([[number(value) for value in values] for values in walk(shown, "drift", N_FRAMES)])
+    np.testing.assert_allclose(told, PIXEL_PM * made.scene.drift[:, ::-1], rtol=6e-4, atol=1e-6)
+    n = len(made.scene.place)
+    share = [number(value) for (value,) in walk(shown, "accepted", N_FRAMES)]
+    accepted = np.where(np.arange(N_FRAMES) < N_FRAMES * 3 // 4, n - 1, n)
+    np.testing.assert_allclose(share, 100 * accepted / n, rtol=6e-4)
+
+
+def test_buttons_and_tables_choose_columns_and_zoom_is_shared(shown, written):
+    made, _ = written
+    n = len(made.scene.place)
+    click_column(shown, made, 0)
+    shown.click("#before")
+    assert chosen(shown) == f"{n} (Ce)"
+    shown.click("#after")
+    shown.click("#after")
+    assert chosen(shown) == f"2 ({KIND})"
+    shown.select_option("#column", label="6")
+    assert chosen(shown) == "6 (Ce)"
+    button = shown.locator(".go").first
+    button.click()
+    assert chosen(shown).split()[0] == button.text_content()
+    shown.focus("#x canvas")
+    shown.keyboard.press("+")
+    settle(shown)
+    assert shown.locator(".chart-whole:visible").count() == 3
+    shown.keyboard.press("0")
+    settle(shown)
+    assert shown.locator(".chart-whole:visible").count() == 0
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_page_follows_the_system_and_is_never_too_wide(chromium, written, theme):
+    with opened(chromium, f"file://{written[0].folder / 'report.html'}", theme) as page:
+        assert page.locator("html").get_attribute("data-theme") == theme
+        page.emulate_media(color_scheme="dark" if theme == "light" else "light")
+        settle(page)
+        assert page.locator("html").get_attribute("data-theme") != theme
+        page.set_viewport_size({"width": 390, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def _nothing_accepted(run):
+    run.values["status"][:] = Status.BELOW_NOISE
+
+
+def _not_calibrated(run):
+    run.about |= {"pixel_size_pm": None, "frame_time_s": None}
+
+
+@pytest.mark.parametrize(
+    ("change", "told", "dots"),
+    [
+        (_no_errors, r"^spread \S+ pm · accepted 100 %", 0),
+        (_nothing_accepted, "^accepted 0 % · residual", 0),
+        (_not_calibrated, r"^spread \S+ px · spread \S+ × stated error · accepted 100 %", 1),
+        (_outside, r"^spread \S+ pm · spread \S+ × stated error · accepted 100 %", 1),
+    ],
+)
+def test_what_is_not_known_is_left_out(chromium, tmp_path, change, told, dots):
+    made = Run(tmp_path)
+    change(made)
+    file = write_report(made.write(), figures=False)
+    with opened(chromium, f"file://{file}") as page:
+        page.select_option("#column", label="2")
+        settle(page)
+        assert re.search(told, page.locator("#said").text_content())
+        assert page.locator("#spread").count() == dots
+
+
+def test_the_page_works_as_the_service_shows_it(chromium, written):
+    made, _ = written
+    with opened(chromium, made.folder / "report.html", policy=_REPORT_POLICY) as page:
+        click_column(page, made, 4)
+        assert chosen(page) == "5 (Ce)"
 
 
 @pytest.mark.usefixtures("no_pictures")

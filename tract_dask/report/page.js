@@ -1,69 +1,153 @@
-(() => {
-  const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim()
+// The parts of the report that answer: the map of columns, the chosen column in time, curves over the frames, dots.
 
-  function model(name) {
-    for (const found of Bokeh.documents) {
-      const one = found.get_model_by_name(name)
-      if (one != null) return one
-    }
-    return null
+import { lineChart } from "./charts.js";
+import { ColumnMap } from "./column_map.js";
+import { setText } from "./dom.js";
+import { significant } from "./format.js";
+import { drawColourBar, scaleOf } from "./number_colours.js";
+import { scatterChart } from "./scatter_chart.js";
+import { theme } from "./theme_colours.js";
+
+const MISSING = -32768; // of 16 bit numbers
+const FEW = 400; // points, up to which each is drawn
+const CHOSEN = 2; // the colour of the chosen column, everywhere
+
+const at = (id) => document.getElementById(id);
+const data = JSON.parse(at("data").textContent);
+const { unit, time_unit: timeUnit, ids, kinds, shades } = data;
+const columns = unpackAll(data.columns), frames = unpackAll(data.frames), time = unpack(data.series.time);
+const inTime = { group: "series", formatX: (value) => `${significant(value, 6)} ${timeUnit}` };
+let chosen = -1, scale = null;
+
+function unpack({ dtype, base64 }) {
+  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  return dtype === "int16" ? new Int16Array(bytes.buffer) : new Float64Array(bytes.buffer);
+}
+
+function unpackAll(packed) { return Object.fromEntries(Object.entries(packed).map(([name, one]) => [name, unpack(one)])); }
+
+const series = Object.fromEntries(["x", "y", "intensity"].map((name) =>
+  [name, Object.fromEntries(Object.entries(data.series[name]).map(([kind, one]) => [kind, unpackAll(one)]))]));
+
+/** The values of a column in time; NaN where no fit is accepted. */
+function valuesOf({ numbers, zero, step }, column) {
+  const own = numbers.subarray(column * time.length, (column + 1) * time.length);
+  return Float64Array.from(own, (number) => (number === MISSING ? NaN : zero[column] + step[column] * number));
+}
+
+// ---- the chosen column in time ----
+const LABELS = { x: `x (${unit})`, y: `y (${unit})`, intensity: "intensity (counts)" };
+const charts = Object.fromEntries(Object.keys(LABELS).map((name) => [name, lineChart(at(name), {
+  ...inTime, height: name === "intensity" ? 186 : 170, levels: name === "intensity" ? [] : [0],
+  xLabel: name === "intensity" ? `time (${timeUnit})` : "", series: [],
+})]));
+
+function seriesOf(name) {
+  const values = Object.fromEntries(Object.entries(series[name]).map(([kind, one]) => [kind, valuesOf(one, chosen)]));
+  const { mean, error, low, high } = values, own = { x: time, y: mean, color: CHOSEN };
+  const line = {
+    ...own, name: LABELS[name], kind: time.length <= FEW ? "dots" : "line",
+    low: mean.map((value, index) => value - error[index]), high: mean.map((value, index) => value + error[index]),
+  };
+  return low ? [line, { ...own, name: "extremes", low, high, kind: "band" }] : [line];
+}
+
+// ---- all columns ----
+const nameOf = (index) => `Column ${ids[index]}${kinds[index] ? ` ${kinds[index]}` : ""}`;
+const textOf = ({ name, unit: own }, index) => `${significant(columns[name][index], 3)}${own ? ` ${own}` : ""}`;
+const rows = ids.map((id, index) => ({ column_id: id, x: columns.x[index], y: columns.y[index], index }));
+
+const map = new ColumnMap(at("map"), at("tip"), {
+  onToggle: ({ index }) => choose(index),
+  describe: ({ index, x, y }) => [nameOf(index), `x ${x.toFixed(2)}, y ${y.toFixed(2)} px`, ...shades.map((shade) => `${shade.label} ${textOf(shade, index)}`)],
+});
+
+const spread = columns.excess && scatterChart(at("spread"), {
+  label: "Spread of each column against its stated error", x: columns.expected, y: columns.spread, xRange: [0, null], yRange: [0, null],
+  xLabel: `stated error (${unit})`, yLabel: `spread (${unit})`, diagonal: true, onPick: choose, nameOf,
+  tell: (index) => `stated error ${significant(columns.expected[index], 3)} ${unit}, spread ${significant(columns.spread[index], 3)} ${unit}`,
+});
+const share = columns.share && columns.r_squared && scatterChart(at("share"), {
+  label: "R² of each column against its share of accepted fits", x: columns.share, y: columns.r_squared,
+  xLabel: "accepted (%)", yLabel: "R²", onPick: choose, nameOf,
+  tell: (index) => `accepted ${significant(columns.share[index], 3)} %, R² ${significant(columns.r_squared[index], 3)}`,
+});
+const scatters = [spread, share].filter(Boolean);
+
+function colour() {
+  const shade = shades.find(({ name }) => name === at("shade").value);
+  scale = shade ? scaleOf([...columns[shade.name]]) : null;
+  map.show({ colourOf: ({ index }) => (scale && Number.isFinite(columns[shade.name][index]) ? scale.colour(columns[shade.name][index]) : null) });
+  drawBar();
+}
+
+function drawBar() {
+  const shade = shades.find(({ name }) => name === at("shade").value);
+  drawColourBar(at("colour-bar"), scale, shade ? `${shade.label}${shade.unit ? ` (${shade.unit})` : ""}` : "");
+}
+
+/** Show a column in time, and where it is among the others. */
+function choose(index) {
+  chosen = index;
+  at("column").value = String(index);
+  setText(at("chosen"), `${ids[index]}${kinds[index] ? ` (${kinds[index]})` : ""}`);
+  setText(at("said"), shades.map((shade) => `${shade.label} ${textOf(shade, index)}`).join(" · "));
+  for (const [name, chart] of Object.entries(charts)) chart.update({ label: `${name} of column ${ids[index]} in time`, empty: "No fit is accepted", series: seriesOf(name) });
+  for (const chart of scatters) chart.update({ chosen: index });
+  mark();
+}
+
+const mark = () => map.show({ chosen: new Map([[ids[chosen], theme.color(`--series-${CHOSEN}`)]]) });
+
+// ---- all frames ----
+const inFrames = { group: "frames", height: 200, formatX: inTime.formatX, xLabel: `time (${timeUnit})` };
+const curve = (name, y, color, own) => ({ name, x: frames.time, y, color, unit: own });
+const frameCharts = [
+  lineChart(at("drift"), { ...inFrames, label: "Drift in time", yLabel: `drift (${unit})`, series: [curve("x", frames.x, 1, unit), curve("y", frames.y, 2, unit)] }),
+  lineChart(at("accepted"), {
+    ...inFrames, label: "Frames in time", yLabel: "%", yRange: [0, 103],
+    series: [curve("accepted fits", frames.share, 1, "%"), ...(frames.quality ? [curve("correlation with the sum", frames.quality, 2, "%")] : [])],
+  }),
+];
+
+async function showImage() {
+  const picture = at("summed"), { width, height, covered, pixel_size_pm: pixelSizePm } = data.image;
+  await picture.decode();
+  const bitmap = await createImageBitmap(picture);
+  picture.remove();
+  map.show({ rows });
+  map.setImage({ width, height, pixelSizePm, picture: { bitmap, width: covered[0], height: covered[1] } });
+}
+
+function listen() {
+  const step = (by) => choose((chosen + by + ids.length) % ids.length);
+  at("column").addEventListener("change", () => choose(Number(at("column").value)));
+  at("before").addEventListener("click", () => step(-1));
+  at("after").addEventListener("click", () => step(1));
+  at("shade").addEventListener("change", colour);
+  for (const button of document.querySelectorAll(".go")) {
+    button.addEventListener("click", () => {
+      choose(Number(button.dataset.place));
+      at("look").scrollIntoView({ behavior: "smooth" });
+    });
   }
+  addEventListener("resize", drawBar);
+  theme.onChange(() => { drawBar(); mark(); });
+  const { dataset } = document.documentElement, before = { theme: "" };
+  addEventListener("beforeprint", () => { // on white paper, and at once
+    before.theme = dataset.theme;
+    dataset.theme = "light";
+    for (const one of [...Object.values(charts), ...scatters, ...frameCharts]) one.paint();
+    drawBar();
+  });
+  addEventListener("afterprint", () => {
+    dataset.theme = before.theme;
+    document.dispatchEvent(new Event("themechange"));
+  });
+}
 
-  function paint() {
-    const ink = style("--ink"), soft = style("--soft"), line = style("--line"), card = style("--card")
-    const looks = {
-      Axis: {axis_label_text_color: ink, major_label_text_color: soft, axis_line_color: soft, major_tick_line_color: soft},
-      Grid: {grid_line_color: line},
-      Legend: {label_text_color: ink, background_fill_color: card, background_fill_alpha: 0.8, border_line_color: null},
-      ColorBar: {title_text_color: ink, major_label_text_color: soft, background_fill_alpha: 0},
-    }
-    for (const found of Bokeh.documents) {
-      for (const one of found.all_models) {
-        for (const [kind, look] of Object.entries(looks)) {
-          if (one.type === kind || (kind === "Axis" && one.type.endsWith("Axis"))) one.setv(look)
-        }
-      }
-    }
-  }
-
-  function start() {
-    const columns = model("columns"), choice = document.getElementById("column"), shade = document.getElementById("shade")
-    const chosen = document.getElementById("chosen")
-    const choose = (place) => { columns.selected.indices = [place] }
-    const step = (by) => choose((Number(choice.value) + by + choice.length) % choice.length)
-    choice.addEventListener("change", () => choose(Number(choice.value)))
-    document.getElementById("before").addEventListener("click", () => step(-1))
-    document.getElementById("after").addEventListener("click", () => step(1))
-    for (const button of document.querySelectorAll(".go")) {
-      button.addEventListener("click", () => {
-        choose(Number(button.dataset.place))
-        document.getElementById("look").scrollIntoView({behavior: "smooth"})
-      })
-    }
-    columns.selected.properties.indices.change.connect(() => {
-      const [place] = columns.selected.indices
-      if (place === undefined) return
-      choice.value = String(place)
-      chosen.textContent = choice.options[choice.selectedIndex].text
-    })
-    const colour = () => {
-      const option = shade.options[shade.selectedIndex]
-      if (option === undefined) return
-      const values = Array.from(columns.data[option.value])
-      const known = values.filter(Number.isFinite).sort((a, b) => a - b)
-      const high = known[Math.min(known.length - 1, Math.floor(0.98 * known.length))]
-      model("shade").setv({low: known[0], high: high > known[0] ? high : known[0] + 1})
-      model("shade_bar").title = option.dataset.label
-      columns.data = {...columns.data, shade: values}
-    }
-    shade.addEventListener("change", colour)
-    colour()
-    choose(Number(choice.value))
-    paint()
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint)
-  }
-
-  const ready = () => (window.Bokeh !== undefined && Bokeh.documents.length > 0 && model("columns") != null
-    ? start() : setTimeout(ready, 30))
-  ready()
-})()
+map.show({ rows });
+listen();
+colour();
+if (ids.length) choose(data.first);
+showImage();

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.embed import components
-from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -23,11 +21,13 @@ from ..analysis.jumps import change_points
 from ..errors import TractError
 from ..provenance import stage_key
 from ..settings import RunSettings, Settings
+from ..web import STATIC, bundle
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import figure_data, windows_data
 from .survey import Survey, residuals, survey
 
+_SCRIPT = Path(__file__).parent / "page.js"
 KEY = '<meta name="tract-dask-key" content="'
 _FIGURE_DPI = 110
 _WORST = 6
@@ -108,16 +108,9 @@ def _events(path: Path) -> list[dict[str, Any]]:
 
 def render(run: Survey, key: str = "", *, figures: bool = True) -> str:
     """Return the page."""
-    source = interactive.column_source(run)
-    answering = {
-        "image": interactive.image_figure(run, source),
-        **{plot.name: plot for plot in interactive.series_figures(run, source)},
-    }
-    answering |= {f"frames_{k}": plot for k, plot in enumerate(interactive.frame_figures(run))}
-    answering |= {f"columns_{k}": plot for k, plot in enumerate(interactive.column_figures(run, source))}
-    for plot in answering.values():
-        interactive.make_plain(plot)
-    script, places = components(answering, wrap_script=True)
+    first, shades = first_column(run), interactive.shades(run)
+    image, about_image = interactive.image_data(run)
+    data = interactive.page_data(run, first) | {"image": about_image}
     loader = Environment(
         loader=PackageLoader("tract_dask", "report"),
         autoescape=True,
@@ -132,12 +125,18 @@ def render(run: Survey, key: str = "", *, figures: bool = True) -> str:
         cards=cards(run),
         findings=findings(run),
         quality=quality(run),
-        places={name: Markup(place) for name, place in places.items()},
-        script=script,
-        library=Resources(mode="inline", components=["bokeh"], minified=True, log_level="error").render_js(),
-        shades=interactive.shades(run),
+        theme_script=Markup((STATIC / "theme.js").read_text(encoding="utf-8")),
+        shared_style=Markup(
+            "".join((STATIC / name).read_text(encoding="utf-8") for name in ("theme.css", "charts.css"))
+        ),
+        script=Markup(bundle(_SCRIPT)),
+        data=Markup(interactive.script_json(data)),
+        image=image,
+        aspect=round(min(2.0, max(0.5, about_image["width"] / about_image["height"])), 3),
+        shades=shades,
+        shown={shade.name for shade in shades},
         ids=run.columns["column_id"].to_numpy().tolist(),
-        first=first_column(run),
+        first=first,
         frames_a_point=run.series.attrs["frames"],
         worst=worst_columns(run),
         residual_limit=RESIDUAL,

@@ -22,6 +22,13 @@ def figure_data(figure: Figure, dpi: float) -> str:
     return _url(file.getvalue(), "webp")
 
 
+def grey_data(levels: NDArray[np.uint8]) -> str:
+    """Return grey levels (y, x) as a data URL (WebP)."""
+    file = io.BytesIO()
+    imsave(file, levels, format="webp", cmap="gray", vmin=0, vmax=255, pil_kwargs={"quality": _QUALITY, "method": 0})
+    return _url(file.getvalue(), "webp")
+
+
 def windows_data(shown: NDArray[np.float64]) -> str:
     """Return the image, the model and the residual of a column side by side as a data URL (PNG).
 

@@ -25,7 +25,7 @@ _ERRORS = errors(400, 404, 503) | NOT_MODIFIED
 _REPORT_POLICY = "; ".join(
     (
         "default-src 'none'",
-        "script-src 'unsafe-inline' 'unsafe-eval'",
+        "script-src 'unsafe-inline'",
         "style-src 'unsafe-inline'",
         "img-src data: blob:",
         "font-src data:",

@@ -10,12 +10,13 @@ from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from fastapi.templating import Jinja2Templates
 
+from ...web import STATIC
 from ..entrance.access import IDENTITY, identity
 
 _FOLDER = Path(__file__).parent
 
 templates = Jinja2Templates(_FOLDER / "templates")
-static_files = StaticFiles(directory=_FOLDER / "static")
+static_files = StaticFiles(directory=_FOLDER / "static", packages=[("tract_dask.web", STATIC.name)])
 pages = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 

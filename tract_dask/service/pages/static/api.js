@@ -141,14 +141,3 @@ export function toast(message, kind = "") {
   place.append(element);
   setTimeout(() => element.remove(), error || kind === "bad" ? 12000 : 5000);
 }
-
-/** The theme: `theme.current` is "light" or "dark"; `theme.onChange(draw)` for what does not follow the style sheet. */
-export const theme = {
-  get current() { return document.documentElement.dataset.theme; },
-  onChange(handle) {
-    document.addEventListener("themechange", handle);
-    return () => document.removeEventListener("themechange", handle);
-  },
-  /** The value of a variable of the style sheet, such as `theme.color("--accent")`. */
-  color(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); },
-};

@@ -1,9 +1,9 @@
 // What the colours of columns mean: a bar with its ends in numbers, and the columns themselves.
 
-import { theme } from "./api.js";
 import { h, setText } from "./dom.js";
 import { significant } from "./format.js";
-import { viridis } from "./results_colours.js";
+import { viridis } from "./number_colours.js";
+import { theme } from "./theme_colours.js";
 
 /** A bar with its two ends in numbers. */
 export class ColourBar {
@@ -17,7 +17,7 @@ export class ColourBar {
     for (let x = 0; x < 256; x += 1) { pen.fillStyle = viridis(x / 255); pen.fillRect(x, 0, 1, 1); }
   }
 
-  /** Show a scale of results_colours.js; `format` turns a value into text. Null hides the bar. */
+  /** Show a scale of number_colours.js; `format` turns a value into text. Null hides the bar. */
   show(scale, format = (value) => significant(value, 3)) {
     this.canvas.style.visibility = scale ? "" : "hidden";
     setText(this.low, scale ? format(scale.low) : "");

@@ -1,8 +1,8 @@
 // Which counts are black and which are white: two handles under a histogram.
 
-import { theme } from "./api.js";
 import { h, setText } from "./dom.js";
 import { significant } from "./format.js";
+import { theme } from "./theme_colours.js";
 
 const STEPS = 1000;
 

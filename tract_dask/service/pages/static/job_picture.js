@@ -5,7 +5,7 @@ import { ColourBar, drawColumn } from "./colour_scale.js";
 import { h, setText } from "./dom.js";
 import { percent, significant } from "./format.js";
 import { ImageView } from "./image_view.js";
-import { scaleOf, viridis } from "./results_colours.js";
+import { scaleOf, viridis } from "./number_colours.js";
 
 const AGAIN_MS = 1500;
 const TRIES = 5; // a store that was just written may not be seen at once

@@ -4,9 +4,9 @@ import { get, subscribe, toast } from "/static/api.js";
 import { histogram } from "/static/charts.js";
 import { h, setAttribute, setText } from "/static/dom.js";
 import { count, hasEnded, isDone, percent, several, significant, STATES } from "/static/format.js";
-import { drawColourBar, scaleOf } from "/static/results_colours.js";
+import { drawColourBar, scaleOf } from "/static/number_colours.js";
 import { Displacements } from "/static/results_displacement.js";
-import { ColumnMap } from "/static/results_map.js";
+import { ResultsMap } from "/static/results_map.js";
 import { MOST, SeriesPanel } from "/static/results_series.js";
 import { ColumnTable } from "/static/results_table.js";
 import { showProvenance } from "/static/results_about.js";
@@ -30,7 +30,7 @@ const QUANTITIES = {
 const valueOf = (row, name = quantity) => (QUANTITIES[name].of ? QUANTITIES[name].of(row) : row[name]);
 const labelOf = (name) => `${QUANTITIES[name].label} (${QUANTITIES[name].unit()})`;
 
-const map = new ColumnMap(at("map"), at("tip"), { job, onToggle: toggle, describe });
+const map = new ResultsMap(at("map"), at("tip"), { job, onToggle: (row, event) => toggle(row.column_id, event), describe });
 const series = new SeriesPanel({ job, onRemove: (id) => choose(chosen.filter((one) => one !== id)) });
 const length = (name, label, title) => ({ name, label: () => `${label} (${unit})`, title, format: (row) => digits(row[name]) });
 const digits = (value) => (value === null ? "–" : value.toPrecision(3)); // with its zeros, so that a column of them aligns

@@ -8,6 +8,7 @@
  *   const view = new ImageView(element, {
  *     width: 576, height: 512,                  // of the image, px
  *     url: (box, w, h) => `/api/v1/...png?box=${box.x0},${box.y0},${box.x1},${box.y1}&width=${w}`,
+ *     picture: { bitmap, width, height },       // in place of `url`: the whole image, and how many of its px the bitmap covers
  *     pixelSizePm: 4,                           // for the scale bar; null: px
  *     onDraw: (ctx, view) => {},                // in CSS px, after view.toScreen(x, y); whenever something moved
  *     onHover: (point, event) => {},            // {x, y} in image coordinates, null when the pointer has left
@@ -300,6 +301,12 @@ export class ImageView {
 
   /** Ask for what is needed and not there: the whole image, and the visible box where that is not fine enough. */
   #load() {
+    const { picture } = this.options;
+    if (picture) {
+      this.whole.put(picture.bitmap, { x0: 0, y0: 0, x1: picture.width, y1: picture.height });
+      this.detail.stale = false;
+      return;
+    }
     const least = Math.max(Math.sqrt((this.width * this.height) / WHOLE), Math.max(this.width, this.height) / LONGEST);
     const coarse = powerOfTwo(2 * least * (1 - 1e-6)); // px of the image to a px of the picture
     this.whole.ask({ x0: 0, y0: 0, x1: this.width, y1: this.height }, coarse);

@@ -20,6 +20,13 @@ export class Picture {
     return this.request !== null;
   }
 
+  /** Show a bitmap that is there already. */
+  put(bitmap, box) {
+    this.bitmap = bitmap;
+    this.shown = this.wanted = { box, level: 1 };
+    this.stale = false;
+  }
+
   covers(box, level) {
     const mine = this.wanted;
     return (

@@ -1,13 +1,12 @@
 // Charts of what changes in time and of how it is spread, drawn on a canvas in the colours of the style sheet.
-// Why not BokehJS: docs/decisions.md. A chart is redrawn whole, at most once a frame of the screen.
+// Why not a library: docs/decisions.md.
 
-import { theme } from "./api.js";
 import { h, setText } from "./dom.js";
 import { significant } from "./format.js";
+import { axisOf, boxOf, Chart, clip, paintAxes, places } from "./chart_base.js";
 import { dot, paintSeries, stroke } from "./chart_paint.js";
-import { extend, firstNotBelow, nearest, padded, tickText, ticks } from "./chart_scale.js";
+import { extend, firstNotBelow, nearest, padded } from "./chart_scale.js";
 
-const FONT = '11.5px system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif';
 const DRAG_PX = 5; // a shorter drag is a click
 
 /**
@@ -17,12 +16,12 @@ const DRAG_PX = 5; // a shorter drag is a click
  * @param {object} options
  *   label: what it shows, for screen readers;  height: px (200)
  *   series: [{ name, x, y, low, high, color, kind, right, unit, dashed }]: `x` ascending; null and NaN are gaps;
- *     `low`, `high` a band; `color` 1 to 6 (a series variable of style.css) or a CSS colour; `kind` "line", "area", "points", "dots" (line and
- *     points), "bars" (`x` holds one edge more than `y`); `right` the right-hand axis
+ *     `low`, `high` a band; `color` 1 to 6 (a series variable of theme.css) or a CSS colour; `kind` "line", "area", "points",
+ *     "dots" (line and points), "bars" (`x` holds one edge more than `y`), "band" (no line); `right` the right-hand axis
  *   xLabel, yLabel, rightLabel: with the unit
  *   xRange, yRange, rightRange: [low, high]; null in it is fitted to the data
  *   formatX, formatY: (number) => text, for what is under the pointer
- *   markers: [{ x, label }]: dashed uprights, named above (leave yLabel empty then)
+ *   markers: [{ x, label }]: dashed uprights, named above (leave yLabel empty then);  levels: [y]: dashed lines across
  *   empty: text while there are no data
  *   group: charts of one group share the pointer's x and the zoom
  *   onRange: ([x0, x1] | null) => …, after a zoom by the user;  onPick: (x) => …, after a click
@@ -42,26 +41,12 @@ export function histogram(element, { edges, counts, name = "", color = 1, ...opt
 
 const groups = new Map();
 
-class LineChart {
+class LineChart extends Chart {
   constructor(element, options) {
-    this.options = { height: 200, series: [], markers: [], empty: "No data yet", formatY: (value) => significant(value, 4), formatX: (value) => significant(value, 5), ...options };
+    super(element, { height: 200, series: [], markers: [], levels: [], empty: "No data yet", formatY: (value) => significant(value, 4), formatX: (value) => significant(value, 5), ...options });
     this.view = null; // x range chosen by the user; null: all
     this.pointer = null; // x under the pointer
-    this.drag = null; // [from, to] in px
-    this.frame = 0;
-    this.legend = h("div", { class: "chart-legend" });
-    this.canvas = h("canvas", { tabindex: 0, role: "img", style: { height: `${this.options.height}px` } });
-    this.whole = h("button", { type: "button", class: "button small chart-whole", hidden: true, onclick: () => this.chooseView(null) }, "Whole range");
-    element.classList.add("chart");
-    element.replaceChildren(this.legend, this.canvas, this.whole);
-    this.element = element;
-    this.sizes = new ResizeObserver(() => this.draw());
-    this.sizes.observe(this.canvas);
-    this.stopTheme = theme.onChange(() => { this.makeLegend(); this.draw(); });
-    this.listen();
     if (options.group) groups.set(options.group, (groups.get(options.group) ?? new Set()).add(this));
-    this.makeLegend();
-    this.draw();
   }
 
   /** Change any option; the view stays where the user has put it. */
@@ -80,11 +65,8 @@ class LineChart {
   }
 
   destroy() {
-    this.sizes.disconnect();
-    this.stopTheme();
-    cancelAnimationFrame(this.frame);
     groups.get(this.options.group)?.delete(this);
-    this.element.replaceChildren();
+    super.destroy();
   }
 
   names() { return this.options.series.map((one) => `${one.name}${one.color}`).join("|"); }
@@ -94,13 +76,10 @@ class LineChart {
     this.values = this.options.series.map(() => h("b", {}));
     this.at = h("span", { class: "chart-at" });
     this.legend.replaceChildren(...this.options.series.map((one, index) =>
-      h("span", { class: "chart-name" }, many && h("span", { class: "chart-key", style: { background: this.colour(one, index) } }), one.name ?? "", " ", this.values[index])), this.at);
+      h("span", { class: "chart-name" }, many && h("span", { class: `chart-key${one.kind === "band" ? " band" : ""}`, style: { background: this.colourOf(one, index) } }), one.name ?? "", " ", this.values[index])), this.at);
   }
 
-  colour(one, index) {
-    const color = one.color ?? index + 1;
-    return typeof color === "number" ? theme.color(`--series-${color}`) : color.startsWith("--") ? theme.color(color) : color;
-  }
+  colourOf(one, index) { return this.colour(one.color ?? index + 1); }
 
   listen() {
     const { canvas } = this;
@@ -116,7 +95,6 @@ class LineChart {
     });
     canvas.addEventListener("pointerup", () => this.drop());
     canvas.addEventListener("pointercancel", () => { this.drag = null; this.draw(); });
-    canvas.addEventListener("dblclick", () => this.chooseView(null));
     canvas.addEventListener("blur", () => this.point(null));
     canvas.addEventListener("keydown", (event) => this.key(event));
   }
@@ -187,96 +165,34 @@ class LineChart {
     return high > low ? [low, high] : [low, low + 1];
   }
 
-  draw() {
-    if (!this.frame) this.frame = requestAnimationFrame(() => { this.frame = 0; this.paint(); });
-  }
-
   paint() {
-    const width = this.canvas.clientWidth, height = this.options.height;
-    if (!width) return;
-    const ratio = devicePixelRatio || 1;
-    const [pixelsX, pixelsY] = [Math.round(width * ratio), Math.round(height * ratio)];
-    if (this.canvas.width !== pixelsX || this.canvas.height !== pixelsY) Object.assign(this.canvas, { width: pixelsX, height: pixelsY });
-    const pen = this.canvas.getContext("2d");
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, width, height);
-    pen.font = FONT;
-    const ink = { text: theme.color("--muted"), line: theme.color("--line"), strong: theme.color("--text"), panel: theme.color("--panel"), accent: theme.color("--accent") };
+    const found = this.begin();
+    if (!found) return;
+    const { pen, width, height, ink } = found, { options } = this;
     this.bounds = this.view ?? this.extent();
-    const hasData = this.options.series.some((one) => one.y.length);
-    const hasRight = this.options.series.some((one) => one.right);
-    const axes = [this.axis(pen, false, height), hasRight ? this.axis(pen, true, height) : null];
-    const box = { left: axes[0].room, right: width - (axes[1] ? axes[1].room : 10), top: 24, bottom: height - 32 };
-    this.toX = (px) => this.bounds[0] + ((px - box.left) / (box.right - box.left)) * (this.bounds[1] - this.bounds[0]);
-    const place = { x: (x) => box.left + ((x - this.bounds[0]) / (this.bounds[1] - this.bounds[0])) * (box.right - box.left) };
-    if (hasData) this.paintAxes(pen, box, axes, place, ink, width, height);
-    pen.save();
-    pen.beginPath();
-    pen.rect(box.left, box.top - 2, box.right - box.left, box.bottom - box.top + 4);
-    pen.clip();
-    this.options.series.forEach((one, index) => {
-      const [low, high] = axes[one.right ? 1 : 0].range;
-      place.y = (y) => box.bottom - ((y - low) / (high - low)) * (box.bottom - box.top);
-      paintSeries(pen, one, this.colour(one, index), this.bounds, place, box);
-    });
-    if (this.drag) {
-      pen.globalAlpha = 0.18;
-      pen.fillStyle = ink.accent;
-      pen.fillRect(Math.min(...this.drag), box.top, Math.abs(this.drag[1] - this.drag[0]), box.bottom - box.top);
-      pen.globalAlpha = 1;
-    }
+    const hasData = options.series.some((one) => one.y.length);
+    const hasRight = options.series.some((one) => one.right);
+    const axes = [false, ...(hasRight ? [true] : [])].map((right) => axisOf(pen, this.rangeY(right, this.bounds), height));
+    const top = options.yLabel || options.rightLabel || options.markers.length ? 24 : 10;
+    const box = boxOf(axes, width, height, top), place = axes.map((axis) => places(box, this.bounds, axis.range));
+    this.toX = place[0].toX;
+    if (hasData) paintAxes(pen, box, axes, this.bounds, ink, options, width, height);
+    clip(pen, box);
+    if (hasData) this.paintLevels(pen, box, place[0], ink);
+    options.series.forEach((one, index) => paintSeries(pen, one, this.colourOf(one, index), this.bounds, place[one.right ? 1 : 0], box));
+    if (this.drag) this.paintDrag(pen, ink, this.drag[0], box.top, this.drag[1], box.bottom);
     pen.restore();
-    this.paintMarkers(pen, box, place, ink);
-    if (hasData) this.paintPointer(pen, box, axes, place, ink);
-    else {
-      pen.fillStyle = ink.text;
-      pen.textAlign = "center";
-      pen.textBaseline = "middle";
-      pen.fillText(this.options.empty, (box.left + box.right) / 2, (box.top + box.bottom) / 2);
-    }
-    this.canvas.setAttribute("aria-label", this.spoken(hasData));
+    this.paintMarkers(pen, box, place[0], ink);
+    if (hasData) this.paintPointer(pen, box, place, ink);
+    else this.paintEmpty(pen, box, ink);
+    this.speak(hasData ? this.summary() : options.empty);
   }
 
-  axis(pen, right, height) {
-    const range = this.rangeY(right, this.bounds);
-    const wanted = Math.max(2, Math.round((height - 52) / 38));
-    const few = ticks(...range, wanted);
-    const { values, step } = few.values.length > 1 ? few : ticks(...range, 2 * wanted); // one number is no scale
-    const texts = values.map((value) => tickText(value, step));
-    return { range, values, texts, room: Math.max(28, ...texts.map((text) => pen.measureText(text).width)) + 10 };
-  }
-
-  paintAxes(pen, box, axes, place, ink, width, height) {
-    pen.lineWidth = 1;
-    pen.textBaseline = "middle";
-    axes.forEach((axis, side) => {
-      if (!axis) return;
-      pen.textAlign = side ? "left" : "right";
-      const [low, high] = axis.range;
-      axis.values.forEach((value, index) => {
-        const y = Math.round(box.bottom - ((value - low) / (high - low)) * (box.bottom - box.top)) + 0.5;
-        pen.strokeStyle = ink.line;
-        if (!side) stroke(pen, box.left, y, box.right, y);
-        pen.fillStyle = ink.text;
-        pen.fillText(axis.texts[index], side ? box.right + 7 : box.left - 7, y);
-      });
-    });
-    const { values, step } = ticks(...this.bounds, Math.max(2, Math.floor((box.right - box.left) / 80)));
-    pen.textBaseline = "top";
-    pen.textAlign = "center";
-    for (const value of values) {
-      const x = Math.round(place.x(value)) + 0.5;
-      pen.strokeStyle = ink.line;
-      stroke(pen, x, box.bottom, x, box.bottom + 4);
-      pen.fillText(tickText(value, step), x, box.bottom + 6);
-    }
-    pen.textAlign = "left";
-    pen.fillText(this.options.yLabel ?? "", 2, 1);
-    pen.textAlign = "right";
-    if (axes[1]) pen.fillText(this.options.rightLabel ?? "", width - 2, 1);
-    pen.textBaseline = "bottom";
-    pen.fillText(this.options.xLabel ?? "", box.right, height);
-    pen.textBaseline = "middle";
+  paintLevels(pen, box, place, ink) {
+    pen.setLineDash([5, 4]);
+    pen.strokeStyle = ink.text;
+    for (const y of this.options.levels) stroke(pen, box.left, Math.round(place.y(y)) + 0.5, box.right, Math.round(place.y(y)) + 0.5);
+    pen.setLineDash([]);
   }
 
   paintMarkers(pen, box, place, ink) {
@@ -294,38 +210,41 @@ class LineChart {
     pen.setLineDash([]);
   }
 
-  paintPointer(pen, box, axes, place, ink) {
-    const { series, formatY, formatX } = this.options;
+  paintPointer(pen, box, place, ink) {
+    const { series, formatX } = this.options;
     const shown = this.pointer !== null && this.pointer >= this.bounds[0] && this.pointer <= this.bounds[1];
     let at = null;
     series.forEach((one, index) => {
       const found = shown ? valueAt(one, this.pointer) : null;
       const known = found && found.y !== null && Number.isFinite(found.y);
-      setText(this.values[index], known ? `${formatY(found.y)}${one.unit ? ` ${one.unit}` : ""}` : "");
+      setText(this.values[index], known ? this.valueText(one, found) : "");
       if (!known) return;
       at ??= found;
-      if (one.kind === "bars") return;
-      const [low, high] = axes[one.right ? 1 : 0].range;
-      const y = box.bottom - ((found.y - low) / (high - low)) * (box.bottom - box.top);
-      dot(pen, place.x(found.x), y, 3.5, this.colour(one, index), ink.panel);
+      if (one.kind === "bars" || one.kind === "band") return;
+      const own = place[one.right ? 1 : 0];
+      dot(pen, own.x(found.x), own.y(found.y), 3.5, this.colourOf(one, index), ink.panel);
     });
     setText(this.at, at ? `at ${at.text ?? formatX(at.x)}` : "");
     if (!at) return;
     pen.strokeStyle = ink.text;
     pen.globalAlpha = 0.5;
-    const x = Math.round(place.x(at.x)) + 0.5;
+    const x = Math.round(place[0].x(at.x)) + 0.5;
     stroke(pen, x, box.top, x, box.bottom);
     pen.globalAlpha = 1;
   }
 
-  spoken(hasData) {
-    const { label, series, formatY, empty } = this.options;
-    if (!hasData) return `${label ?? "Chart"}: ${empty}`;
+  valueText(one, { y, low, high }) {
+    const { formatY } = this.options;
+    return `${one.kind === "band" ? `${formatY(low)} to ${formatY(high)}` : formatY(y)}${one.unit ? ` ${one.unit}` : ""}`;
+  }
+
+  summary() {
+    const { series, formatY } = this.options;
     const parts = series.map((one) => {
       const range = extend([Infinity, -Infinity], one.y);
       return range[0] <= range[1] ? `${one.name ?? ""} from ${formatY(range[0])} to ${formatY(range[1])}` : "";
     });
-    return `${label ?? "Chart"}: ${parts.filter(Boolean).join("; ")}`;
+    return parts.filter(Boolean).join("; ");
   }
 }
 
@@ -333,7 +252,7 @@ function valueAt(one, x) {
   if (!one.y.length) return null;
   if (one.kind !== "bars") {
     const index = nearest(one.x, x);
-    return { x: one.x[index], y: one.y[index] };
+    return { x: one.x[index], y: one.y[index], low: one.low?.[index], high: one.high?.[index] };
   }
   const index = Math.min(Math.max(firstNotBelow(one.x, x) - 1, 0), one.y.length - 1);
   return { x, y: one.y[index], text: `${significant(one.x[index], 3)} to ${significant(one.x[index + 1], 3)}` };

@@ -9,6 +9,7 @@ export function paintSeries(pen, one, colour, [x0, x1], place, box) {
   if (one.kind === "bars") { paintBars(pen, one, place, box); return; }
   const start = Math.max(0, firstNotBelow(one.x, x0) - 1), stop = Math.min(one.y.length, firstNotBelow(one.x, x1) + 1);
   if (one.low) paintBand(pen, one, start, stop, place);
+  if (one.kind === "band") return;
   pen.lineWidth = 1.6;
   pen.lineJoin = "round";
   pen.setLineDash(one.dashed ? [5, 4] : []);
@@ -46,21 +47,28 @@ function paintBars(pen, one, place, box) {
 
 function paintBand(pen, one, start, stop, place) {
   pen.globalAlpha = 0.2;
-  for (let from = start; from < stop; from += 1) {
-    let to = from;
-    while (to < stop && known(one.low[to]) && known(one.high[to])) to += 1;
-    if (to - from > 1) {
-      pen.beginPath();
-      for (let index = from; index < to; index += 1) pen.lineTo(place.x(one.x[index]), place.y(one.high[index]));
-      for (let index = to - 1; index >= from; index -= 1) pen.lineTo(place.x(one.x[index]), place.y(one.low[index]));
-      pen.fill();
-    } else if (to - from === 1) {
-      const x = place.x(one.x[from]);
-      stroke(pen, x, place.y(one.low[from]), x, place.y(one.high[from]));
-    }
-    from = to;
+  for (const run of bands(one, start, stop, place)) {
+    if (run.length === 1) { stroke(pen, run[0].x, run[0].low, run[0].x, run[0].high); continue; }
+    pen.beginPath();
+    for (const { x, high } of run) pen.lineTo(x, high);
+    for (const { x, low } of run.reverse()) pen.lineTo(x, low);
+    pen.fill();
   }
   pen.globalAlpha = 1;
+}
+
+/** The runs of a band between gaps, in px; where several fall on a pixel, as far as they reach together. */
+function bands(one, start, stop, place) {
+  const runs = [];
+  let run = null;
+  for (let index = start; index < stop; index += 1) {
+    if (!known(one.low[index]) || !known(one.high[index])) { run = null; continue; }
+    if (!run) runs.push(run = []);
+    const x = place.x(one.x[index]), low = place.y(one.low[index]), high = place.y(one.high[index]), last = run[run.length - 1];
+    if (last && Math.floor(last.x) === Math.floor(x)) Object.assign(last, { low: Math.max(last.low, low), high: Math.min(last.high, high) });
+    else run.push({ x, low, high });
+  }
+  return runs;
 }
 
 /** The runs between gaps as points in px; where several fall on a pixel, its first, lowest, highest and last. */

@@ -1,7 +1,7 @@
 // Colours for numbers: viridis, which is even to the eye, also to those who do not see red and green apart.
 
-import { theme } from "/static/api.js";
-import { tickText, ticks } from "/static/chart_scale.js";
+import { tickText, ticks } from "./chart_scale.js";
+import { theme } from "./theme_colours.js";
 
 const VIRIDIS = [
   [68, 1, 84], [72, 26, 108], [71, 47, 125], [65, 68, 135], [57, 86, 140], [49, 104, 142], [42, 120, 142], [35, 136, 142],
