@@ -370,7 +370,11 @@ def test_a_zip_goes_out_piece_by_piece(service, monkeypatch):
 
 def test_tables_and_netcdf(service, tmp_path):
     service.fits.write(0, 2)
-    assert service.get(f"{service.job}/results/download?format=csv&prepare=true").json()["ready"]
+    for _ in range(10):  # each waits for some seconds
+        if service.get(f"{service.job}/results/download?format=csv&prepare=true").json()["ready"]:
+            break
+    else:
+        pytest.fail("the table does not get ready")
     answer = service.get(f"{service.job}/results/download?format=csv")
     table = pd.read_csv(io.BytesIO(answer.content))
     assert int(answer.headers["content-length"]) == len(answer.content)
