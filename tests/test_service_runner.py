@@ -453,9 +453,14 @@ def test_a_folder_that_another_run_holds_is_waited_for(whole, client, tmp_path):
         assert run(movie, output, client, until="convert", patience_s=30.0).state == "stopped"
 
 
+def groups(dask_scheduler) -> list[str]:
+    return list(dask_scheduler.task_groups)
+
+
 def test_a_process_ends_with_its_standard_input(whole, client, tmp_path):
     """What a killed service leaves behind ends at once, and its tasks with it."""
     order = {
+        "job": "3f9a0c12de",
         "source": str(whole.root.parent / "movie.npy"),
         "output": str(tmp_path / "out"),
         "settings": SETTINGS,
@@ -468,6 +473,7 @@ def test_a_process_ends_with_its_standard_input(whole, client, tmp_path):
         process.stdin.write(json.dumps(order) + "\n")
         process.stdin.flush()
         assert any('"convert"' in line for line in process.stdout), "it is at work"
+        wait(lambda: any("convert-job_3f9a0c12de-" in name for name in client.run_on_scheduler(groups)))
         process.stdin.close()
         began = time.monotonic()
         assert process.wait(PATIENCE_S) == -signal.SIGKILL

@@ -32,6 +32,9 @@ from .stores import disk_errors, json_ready, remove, write_aside
 PATIENCE = "tract_dask.patience-s"
 """Item of Dask's configuration: for how long, in s, work waits while the cluster has no worker."""
 
+JOB = "tract_dask.job"
+"""Item of Dask's configuration: the job that work is part of, to be named with its tasks."""
+
 _PATIENCE_S = 60.0
 _SETTLE_S = 15.0
 """For so long an interrupted run waits for the tasks that are being executed."""
@@ -302,7 +305,7 @@ def _run_on(client: Client, work: Work, todo: Numbers, shards: Sequence[Shard], 
 
     The window grows with the cluster, whose workers may come one after the other.
     """
-    group = f"{name}-{uuid.uuid4().hex}"
+    group = task_group(name)
     packed, queue, size = _Packed(work), _Queue(todo), 1
     running: dict[Any, Numbers] = {}
     completed = as_completed()
@@ -331,6 +334,19 @@ def _run_on(client: Client, work: Work, todo: Numbers, shards: Sequence[Shard], 
         if running and client.status == "running":
             client.cancel(list(running), force=True)
             _settle(client, group)
+
+
+def task_group(name: str) -> str:
+    """Return a new name for a group of tasks, of which Dask shows the first part as that of their kind.
+
+    Examples
+    --------
+    >>> with dask.config.set({JOB: "3f9a0c12de"}):
+    ...     task_group("fit")[:20]
+    'fit-job_3f9a0c12de-'
+    """
+    job = dask.config.get(JOB, "")
+    return "-".join((name, *([f"job_{job}"] if job else []), uuid.uuid4().hex))
 
 
 def _settle(client: Client, group: str) -> None:

@@ -182,6 +182,7 @@ class Attempt(Thread):
         version = job.columns_version
         columns = None if version is None else self._store.columns(job.id, version) if version else ""
         return {
+            "job": job.id,
             "source": self._root.source(job.source),
             "output": str(self._root.resolve(job.output, must_exist=False)),
             "settings": to_dict(inside(self._root, job_settings(job.settings))),

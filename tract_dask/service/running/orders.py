@@ -10,6 +10,7 @@ from pathlib import Path
 from time import monotonic
 from typing import IO, Any
 
+import dask
 from distributed import default_client
 from distributed.comm import CommClosedError
 
@@ -17,6 +18,7 @@ from ... import pipeline, stores
 from ...errors import ClusterError, TractError
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, silent
 from ...settings import RunSettings, from_dict
+from ...shards import JOB
 from ...terminal import clock
 from .timeline import Timeline
 
@@ -100,6 +102,7 @@ def run_order(order: dict[str, Any], on_event: Reporter) -> pipeline.RunOutcome:
     TractError
         As :func:`tract_dask.pipeline.run`.
     """
+    dask.config.set({JOB: order["job"]})
     settings = from_dict(RunSettings, {**order["settings"], "cluster": order["cluster"]})
     source, output = order["source"], Path(order["output"])
     outputs, columns = pipeline.Outputs(output), order["columns"]
