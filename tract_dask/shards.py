@@ -342,7 +342,7 @@ def task_group(name: str) -> str:
     Examples
     --------
     >>> with dask.config.set({JOB: "3f9a0c12de"}):
-    ...     task_group("fit")[:20]
+    ...     task_group("fit")[:19]
     'fit-job_3f9a0c12de-'
     """
     job = dask.config.get(JOB, "")
