@@ -37,6 +37,17 @@ def _untraced(compile_):
 Dispatcher.compile = _untraced(Dispatcher.compile)
 
 
+@pytest.fixture(scope="module")
+def chromium():
+    """A browser: Debian's Chromium, without which these tests fail."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
 @dataclass
 class Scene:
     """A grid of elliptical Gaussians on a flat background, with vacuum above it.

@@ -17,7 +17,7 @@ import pytest
 import xarray as xr
 from matplotlib.path import Path
 from PIL import Image
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
 from tract_dask import stores
 from tract_dask.editor import ColumnEditor, edit_columns, edit_table
@@ -50,14 +50,6 @@ def summed(places: np.ndarray[Any, Any], shape: tuple[int, int] = SHAPE) -> xr.D
         image += 5 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * SIGMA**2))
     exposure = np.full(shape, 40, np.uint32)
     return xr.Dataset({"image": (("y", "x"), image), "exposure": (("y", "x"), exposure)}, attrs={"pixel_size_pm": 8.0})
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 class Seat:
@@ -147,9 +139,9 @@ def seated(browser: Browser, image: xr.Dataset, columns: xr.Dataset, **options: 
 
 
 @pytest.fixture(scope="module")
-def opened(browser: Browser) -> Iterator[Seat]:
+def opened(chromium: Browser) -> Iterator[Seat]:
     """An editor that begins with every column but the last one."""
-    with seated(browser, summed(TRUTH), column_dataset(TRUTH[:-1])) as seat:
+    with seated(chromium, summed(TRUTH), column_dataset(TRUTH[:-1])) as seat:
         yield seat
 
 
@@ -159,11 +151,11 @@ def seat(opened: Seat) -> Seat:
     return opened
 
 
-def test_a_place_in_the_image_is_that_place_on_the_screen(browser: Browser) -> None:
+def test_a_place_in_the_image_is_that_place_on_the_screen(chromium: Browser) -> None:
     """The light of the window itself: nine bright pixels around (97, 61) are where the editor says that (97, 61) is."""
     image = summed(TRUTH[:0]).assign(image=(("y", "x"), np.full(SHAPE, 10.0)))
     image["image"][60:63, 96:99] = 100.0
-    with seated(browser, image, column_dataset([[30.0, 30.0]])) as seat:
+    with seated(chromium, image, column_dataset([[30.0, 30.0]])) as seat:
         seat.run("document.getElementById('show-columns').click()")
         for scale in (0.7, 1.0, 3.0, 17.3):
             seat.run(f"editor.view.center(90.2, 66.7, {scale}); await new Promise((done) => setTimeout(done, 100))")
@@ -272,10 +264,10 @@ def test_every_step_back_restores_what_was(seat: Seat) -> None:
         assert json.dumps(seat.rows()) == state
 
 
-def test_three_clicks_lay_a_lattice(browser: Browser) -> None:
+def test_three_clicks_lay_a_lattice(chromium: Browser) -> None:
     """The sites are those of lattice_columns between the columns that were clicked; those that are columns stay."""
     start = TRUTH[[0, 3, 21]]  # origin, three columns along a, three rows along b
-    with seated(browser, summed(TRUTH), column_dataset(start)) as seat:
+    with seated(chromium, summed(TRUTH), column_dataset(start)) as seat:
         seat.page.keyboard.press("t")
         for place in start:
             seat.click(place[0] + 0.6, place[1] - 0.5)
@@ -340,10 +332,10 @@ def test_versions_are_kept_and_loaded(seat: Seat) -> None:
     assert seat.editor.columns["column_id"].to_numpy().tolist() == [1, *range(3, 35)]
 
 
-def test_going_on_ends_the_wait(browser: Browser) -> None:
+def test_going_on_ends_the_wait(chromium: Browser) -> None:
     saved: list[int] = []
     keep = {"on_saved": lambda columns: saved.append(columns.sizes["column_id"])}
-    with seated(browser, summed(TRUTH), column_dataset(TRUTH), **keep) as seat:
+    with seated(chromium, summed(TRUTH), column_dataset(TRUTH), **keep) as seat:
         seat.click(*TRUTH[34])
         seat.page.keyboard.press("Delete")
         seat.page.click("text=Save and close")
@@ -353,13 +345,13 @@ def test_going_on_ends_the_wait(browser: Browser) -> None:
     assert columns["column_id"].to_numpy().tolist() == list(range(1, 35))
 
 
-def test_twenty_thousand_columns_stay_quick(browser: Browser) -> None:
+def test_twenty_thousand_columns_stay_quick(chromium: Browser) -> None:
     """Hits look at the neighbourhood only, and a step of the view is drawn in a small part of a second."""
     j, i = np.mgrid[0:100, 0:200].reshape(2, -1)
     places = np.stack([6.0 + 10 * i, 6.0 + 10 * j], axis=1)
     flat = {"image": np.ones((1010, 2010)), "exposure": np.ones((1010, 2010), np.uint32)}
     image = xr.Dataset({name: (("y", "x"), values) for name, values in flat.items()})
-    with seated(browser, image, column_dataset(places)) as seat:
+    with seated(chromium, image, column_dataset(places)) as seat:
         timed = (
             "const began = performance.now(); for (let n = 0; n < %d; n++) %s; return (performance.now() - began) / %d"
         )

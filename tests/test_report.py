@@ -12,7 +12,6 @@ import pytest
 import xarray as xr
 from conftest import Scene
 from matplotlib import colormaps
-from playwright import sync_api as playwright
 
 from tract_dask import results, schema, stores
 from tract_dask.errors import StoreError
@@ -26,7 +25,6 @@ from tract_dask.settings import FitSettings, RunSettings, to_toml
 from tract_dask.shards import Shard
 
 N_FRAMES, ERROR_PX, PIXEL_PM = 40, 0.5, 4.0
-CHROMIUM = "/usr/bin/chromium"
 WAIT_MS = 15_000
 KIND = "Ce</script><!--<b>&"
 VOID = {"meta", "link", "img", "br", "hr", "input"}
@@ -349,14 +347,6 @@ def test_page_is_small_and_has_no_library(written):
     text = write_report(made.folder, made.folder / "small.html", figures=False).read_text(encoding="utf-8")
     assert "bokeh" not in text.lower()
     assert len(text) < 250_000
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @contextmanager

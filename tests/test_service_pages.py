@@ -2,7 +2,6 @@
 
 import re
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from serviced import listening, make_root
 from tract_dask.progress import REPORT, STAGES
 from tract_dask.service.jobs.states import State
 from tract_dask.settings import ClusterSettings
-
-CHROMIUM = Path("/usr/bin/chromium")
 
 THEMES = ("light", "dark")
 PATIENCE_MS = 15_000
@@ -34,14 +31,6 @@ PAIRS = [
     ("on-accent", "accent-fill"),
     ("on-accent", "accent-fill-hover"),
 ]
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from tract_dask import open_results, results, stores
 
 expect = sync_api.expect
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 SHAPE = (90, 100)
 WAIT_MS = 30_000
@@ -41,18 +39,10 @@ def job(tmp_path_factory):
         yield f"{address}/jobs/{made.id}/results", fits
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with sync_api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield found
-        found.close()
-
-
 @pytest.fixture
-def page(browser, job):
+def page(chromium, job):
     """The page, once it shows results; what goes wrong in it fails the test."""
-    shown, wrong = browser.new_page(viewport={"width": 1366, "height": 768}), []
+    shown, wrong = chromium.new_page(viewport={"width": 1366, "height": 768}), []
     shown.set_default_timeout(WAIT_MS)
     shown.on("pageerror", lambda error: wrong.append(str(error)))
     shown.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)

@@ -3,12 +3,9 @@
 from pathlib import Path
 
 import pytest
-from playwright import sync_api as playwright
 
 from tract_dask.service.pages import static_files
 from tract_dask.web import bundle
-
-CHROMIUM = "/usr/bin/chromium"
 
 
 @pytest.fixture
@@ -23,7 +20,7 @@ def modules(tmp_path):
     return write
 
 
-def test_every_module_keeps_its_own_names(modules):
+def test_every_module_keeps_its_own_names(chromium, modules):
     page = modules(
         page='import { first } from "./one.js";\nimport { second, More } from "./two.js";\n'
         "const secret = 3;\nglobalThis.found = [first(), second, new More().value, secret];\n",
@@ -33,12 +30,9 @@ def test_every_module_keeps_its_own_names(modules):
     )
     script = bundle(page)
     assert script.count("function first()") == 1
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        shown = browser.new_page()
-        shown.set_content(f'<script type="module">{script}</script>')
-        assert shown.evaluate("globalThis.found") == [1, 3, 20, 3]
-        browser.close()
+    shown = chromium.new_page()
+    shown.set_content(f'<script type="module">{script}</script>')
+    assert shown.evaluate("globalThis.found") == [1, 3, 20, 3]
 
 
 @pytest.mark.parametrize(

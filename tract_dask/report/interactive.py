@@ -44,14 +44,14 @@ def shades(run: Survey) -> list[Shade]:
 
 def page_data(run: Survey, first: int) -> dict[str, Any]:
     """Return what is drawn, arrays as of :func:`packed`; ``first`` is the place of the column that is shown first."""
-    columns = run.columns
+    columns, known = run.columns, shades(run)
     numbers = {"x": columns["x_ref"], "y": columns["y_ref"], "expected": columns["expected"]}
-    numbers |= {shade.name: columns[shade.name] * shade.factor for shade in shades(run)}
+    numbers |= {shade.name: columns[shade.name] * shade.factor for shade in known}
     return {
         "unit": run.unit,
         "time_unit": run.time_unit,
         "first": first,
-        "shades": [{"name": shade.name, "label": shade.label, "unit": shade.unit} for shade in shades(run)],
+        "shades": [{"name": shade.name, "label": shade.label, "unit": shade.unit} for shade in known],
         "ids": columns["column_id"].to_numpy().tolist(),
         "kinds": [str(kind) for kind in columns["kind"].to_numpy()],
         "columns": {name: packed(values.to_numpy().astype(float)) for name, values in numbers.items()},

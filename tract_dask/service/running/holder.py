@@ -44,6 +44,7 @@ def _hold(order: dict[str, Any], prepared: Event, gone: Event) -> None:
     with uncollected():
         from ...cluster import hold
         from ...settings import ClusterSettings, from_dict
+        from ...stores import write_aside
 
     settings, file = from_dict(ClusterSettings, order["settings"]), Path(order["file"])
     prepared.set()
@@ -51,9 +52,7 @@ def _hold(order: dict[str, Any], prepared: Event, gone: Event) -> None:
         return
     with hold(settings) as cluster:
         about = {"type": "Scheduler", "address": cluster.scheduler_address, "dashboard": cluster.dashboard_link}
-        aside = file.with_name(f".{file.name}.part")
-        aside.write_text(json.dumps(about), encoding="utf-8")
-        aside.replace(file)
+        write_aside(file, json.dumps(about).encode())
         gone.wait()
 
 
