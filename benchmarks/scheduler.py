@@ -9,8 +9,10 @@ from typing import Any
 import psutil
 
 from tract_dask.cluster import connect
+from tract_dask.journal import Journal, Payload
 from tract_dask.settings import ClusterSettings
-from tract_dask.shards import Journal, Payload, Shard, run_shards, split
+from tract_dask.shards import Shard, split
+from tract_dask.tasks import run_shards
 
 from .sizes import Size
 

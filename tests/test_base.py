@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from tract_dask import progress, provenance, settings, stores
 from tract_dask.errors import DestinationError, SettingsError, SourceError, StoreError, TractError
+from tract_dask.journal import Journal
 from tract_dask.settings import ColumnSettings, FitSettings, RunSettings
-from tract_dask.shards import Journal, Shard, run_shards, split
+from tract_dask.shards import Shard, split
+from tract_dask.tasks import run_shards
 
 
 @given(n_frames=st.integers(1, 5000), per_shard=st.integers(1, 600))

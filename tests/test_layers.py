@@ -9,10 +9,10 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"provenance", "stores", "shards"}
+STORES = GROUND | {"journal", "provenance", "shards", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
-RUN = STAGES | {"cluster", "stages", "pipeline", "tls"}
+RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
 
 ALLOWED = {
     "errors": set(),
@@ -22,15 +22,17 @@ ALLOWED = {
     "settings": {"errors"},
     "provenance": {"settings"},
     "stores": {"errors", "schema"},
-    "shards": {"errors", "stores"},
+    "shards": set(),
+    "journal": {"shards", "stores"},
+    "tasks": {"errors", "journal", "shards"},
     "kernels": set(),
     "io": STORES,
     "shard_files": set(),
     "layout": {"settings", "kernels", "shard_files"},
     "ome": {"schema", "stores"},
     "movie": STORES | {"kernels", "ome", "shard_files"},
-    "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files"},
-    "passes": STORES | {"movie"},
+    "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files", "tasks"},
+    "passes": STORES | {"movie", "tasks"},
     "lattice": {"kernels"},
     "seeds": GROUND,
     "windows": {"errors"},
@@ -43,7 +45,7 @@ ALLOWED = {
     "summing": MOVIE | {"passes"},
     "detection": MOVIE | {"lattice", "passes", "seeds", "windows"},
     "columns": MOVIE | {"detection", "lattice", "seeds", "windows"},
-    "fit": MOVIE | {"measure", "results", "vacuum", "windows"},
+    "fit": MOVIE | {"measure", "results", "tasks", "vacuum", "windows"},
     "comparison": MOVIE | {"filtering", "fit", "measure", "plots"},
     "dose": MOVIE | {"fit", "shard_files"},
     "analysis": MOVIE | {"columns", "measure", "results", "seeds", "vacuum", "windows"},
@@ -55,7 +57,7 @@ ALLOWED = {
     "supervision": set(),
     "ssh": {"errors", "forkserver", "settings", "supervision", "tls"},
     "dask_dashboard": set(),
-    "cluster": {"dask_dashboard", "errors", "settings", "forkserver", "shards", "slurm", "ssh", "tls"},
+    "cluster": {"dask_dashboard", "errors", "settings", "forkserver", "slurm", "ssh", "tasks", "tls"},
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,

@@ -19,12 +19,13 @@ from serviced import Here, make_app
 
 from tract_dask import open_results, results, schema, stores
 from tract_dask.analysis import motion
+from tract_dask.journal import Journal, journal_beside
 from tract_dask.provenance import provenance
 from tract_dask.schema import Status
 from tract_dask.service.data import exports, track_cache, tracks
 from tract_dask.service.data.exports import Exports
 from tract_dask.settings import FitSettings
-from tract_dask.shards import Journal, journal_beside, split
+from tract_dask.shards import split
 
 N_FRAMES, N_COLUMNS, STEP = 23, 6, 4
 PIXEL_PM, FRAME_S = 4.0, 0.1

@@ -21,7 +21,7 @@ from distributed.system import MEMORY_LIMIT
 from . import dask_dashboard, forkserver
 from .errors import ClusterError, SettingsError
 from .settings import ClusterSettings
-from .shards import PATIENCE, patience_s
+from .tasks import PATIENCE, patience_s
 from .tls import checked_address, security, worker_flags
 
 PACKAGE = "tract_dask"

@@ -26,6 +26,7 @@ from zarr.codecs import BloscCodec
 from . import schema, stores
 from .errors import DestinationError, SourceError
 from .io import FrameSource, SourceMetadata, open_cached, open_source
+from .journal import Journal, Payload, journal_beside
 from .kernels.binning import FrameMeter
 from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
 from .ome import AXES, describe
@@ -33,7 +34,8 @@ from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import fingerprint, provenance, stage_key
 from .settings import ConvertSettings, MetadataSettings, SourceSettings
 from .shard_files import BLOSC, Grid, ShardWriter, shard_path
-from .shards import Journal, Payload, Shard, journal_beside, split, stream_shards
+from .shards import Shard, split
+from .tasks import stream_shards
 
 _DEFAULT_LAYOUT = ConvertSettings()
 

@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from . import schema
 from .errors import InputError, SettingsError
+from .journal import Payload
 from .kernels.peaks import centroids, local_maxima
 from .lattice import Relief, binned, find_lattice, pixel_noise, relief
 from .movie import Movie
@@ -34,7 +35,7 @@ from .progress import Sink, silent
 from .provenance import stage_key
 from .seeds import column_dataset, positions
 from .settings import ColumnSettings
-from .shards import Payload, Shard
+from .shards import Shard
 from .stores import load_array
 from .windows import default_window
 

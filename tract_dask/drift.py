@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from . import schema
 from .errors import SettingsError, SourceError
+from .journal import Payload
 from .kernels.alignment import Template, align
 from .kernels.registration import (
     Floats,
@@ -45,7 +46,7 @@ from .passes import Passes, save_array
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
-from .shards import Payload, Shard, Shards, split
+from .shards import Shard, Shards, split
 from .stores import load_array
 
 Bools = NDArray[np.bool_]

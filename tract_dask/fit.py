@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from . import results, schema, stores
 from .errors import SettingsError
+from .journal import Journal, Payload, journal_beside
 from .kernels.gaussian import blurred
 from .measure import Floats, Job, measure
 from .movie import Movie
@@ -22,7 +23,8 @@ from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
 from .settings import FitSettings, from_toml
-from .shards import Journal, Payload, Shard, journal_beside, stream_shards
+from .shards import Shard
+from .tasks import stream_shards
 from .vacuum import check_box, find_vacuum
 from .windows import check_window, default_window, neighbour_distance
 

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from . import schema, stores
 from .errors import MissingStoreError, StoreError
+from .journal import entries, journal_beside
 from .kernels.filters import Tiles
 from .ome import AXES
 from .shard_files import Grid, ShardReader, overlaps, shard_path
-from .shards import Shard, Shards, entries, journal_beside, split
+from .shards import Shard, Shards, split
 
 Frames: TypeAlias = NDArray[Any]
 _EVERYTHING = slice(None)

@@ -14,10 +14,12 @@ import numpy as np
 from distributed import Client
 from numpy.typing import NDArray
 
+from .journal import Journal, Payload
 from .movie import Movie
 from .progress import ShardDone, Sink, StageDone, StageStarted
-from .shards import Journal, Payload, Shard, run_shards
+from .shards import Shard
 from .stores import disk_errors
+from .tasks import run_shards
 
 
 class Passes:

@@ -22,6 +22,7 @@ from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError
 from .fit import FitSummary
 from .io import FrameSource, open_source
+from .journal import journal_beside
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
 from .progress import (
@@ -40,7 +41,7 @@ from .progress import (
 )
 from .seeds import read_columns_csv
 from .settings import ClusterSettings, RunSettings, to_toml
-from .shards import journal_beside, split
+from .shards import split
 from .stages import columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
 from .windows import check_window
 

@@ -18,10 +18,11 @@ from zarr.codecs import BloscCodec
 
 from . import schema, stores
 from .errors import MissingStoreError, SettingsError
+from .journal import entries, journal_beside
 from .schema import REJECTED, Status
 from .settings import FitSettings, from_toml
 from .shard_files import BLOSC, encode
-from .shards import Shard, entries, journal_beside
+from .shards import Shard
 
 CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose")
 """What pixels and frames mean: attributes of the store, which any reader finds there."""

@@ -23,13 +23,13 @@ from .conversion import convert, movie_key
 from .drift import estimate_drift
 from .errors import DestinationError
 from .io import FrameSource
+from .journal import journal_beside
 from .movie import Movie, open_movie
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import Status
 from .seeds import write_columns_csv
 from .settings import ColumnSettings, DriftSettings, FitSettings, RunSettings, Settings
-from .shards import journal_beside
 from .summing import sum_image
 
 Workers = Callable[[], Client]

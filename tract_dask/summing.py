@@ -13,12 +13,13 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import schema
+from .journal import Payload
 from .kernels.sums import add_frames, coverage
 from .movie import Movie
 from .passes import Passes, save_array
 from .progress import Sink, silent
 from .provenance import stage_key
-from .shards import Payload, Shard, split
+from .shards import Shard, split
 from .stores import load_array
 
 Bools = NDArray[np.bool_]

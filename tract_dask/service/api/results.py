@@ -12,7 +12,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
-from ...shards import journal_beside
+from ...journal import journal_beside
 from ..data import exports, tracks
 from .answers import NOT_MODIFIED, kept_answer, stamp
 from .models import JobId, errors

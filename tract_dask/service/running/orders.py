@@ -18,7 +18,7 @@ from ... import pipeline, stores
 from ...errors import ClusterError, TractError
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, silent
 from ...settings import RunSettings, from_dict
-from ...shards import JOB
+from ...tasks import JOB
 from ...terminal import clock
 from .timeline import Timeline
 

@@ -13,9 +13,11 @@ from distributed import Client, LocalCluster, as_completed
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tract_dask import shards
+from tract_dask import tasks
 from tract_dask.errors import ClusterError, StoreError
-from tract_dask.shards import Journal, Shard, run_shards, split, stream_shards
+from tract_dask.journal import Journal
+from tract_dask.shards import Shard, split
+from tract_dask.tasks import run_shards, stream_shards
 
 
 @pytest.fixture
@@ -89,16 +91,16 @@ def test_thousands_of_small_shards_each_run_once(cluster, tmp_path):
 
 
 def test_a_batch_ends_when_its_time_is_up(tmp_path, monkeypatch):
-    monkeypatch.setattr(shards, "_BATCH_S", 0.3)
+    monkeypatch.setattr(tasks, "_BATCH_S", 0.3)
     journal = Journal(tmp_path / "journal", "key")
-    payloads, seconds = shards._work(wait_long, split(100, 1), journal, np.arange(4, 90))
+    payloads, seconds = tasks._work(wait_long, split(100, 1), journal, np.arange(4, 90))
     assert sorted(journal.done()) == list(range(4, 4 + len(payloads)))
     assert 0 < len(payloads) <= 2
     assert seconds > 0.3
 
 
 def test_what_a_batch_leaves_comes_first_again():
-    queue = shards._Queue(np.arange(10))
+    queue = tasks._Queue(np.arange(10))
     batch = queue.take(6)
     queue.give_back(batch[2:])
     assert queue.left == 8
@@ -139,7 +141,7 @@ def test_whoever_takes_the_payloads_may_stop_the_work(cluster, tmp_path):
 
 
 def test_a_cluster_that_loses_all_its_workers_is_given_up(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr(shards, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(tasks, "_PATIENCE_S", 1.0)
     journal = Journal(tmp_path / "journal", "key")
 
     def leave():
@@ -162,7 +164,7 @@ def test_a_result_that_its_worker_took_along_is_not_waited_for(cluster, tmp_path
                 time.sleep(0.01)
             return future
 
-    monkeypatch.setattr(shards, "_PATIENCE_S", 1.0)
-    monkeypatch.setattr(shards, "as_completed", Leaving)
+    monkeypatch.setattr(tasks, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(tasks, "as_completed", Leaving)
     with Client(cluster) as client, pytest.raises(ClusterError, match="without a worker"):
         run_shards(wait_long, split(10, 1), journal=Journal(tmp_path / "journal", "key"), name="wait", client=client)
