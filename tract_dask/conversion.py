@@ -21,7 +21,6 @@ import numpy as np
 import zarr
 from distributed import Client
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
 
 from . import schema, stores
 from .errors import DestinationError, SourceError
@@ -33,7 +32,7 @@ from .ome import AXES, describe
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import fingerprint, provenance, stage_key
 from .settings import ConvertSettings, MetadataSettings, SourceSettings
-from .shard_files import BLOSC, Grid, ShardWriter, shard_path
+from .shard_files import CHUNK_KEYS, Grid, ShardWriter, chunk_path, codecs
 from .shards import Shard, split
 from .tasks import stream_shards
 
@@ -220,7 +219,8 @@ def _writer(job: _Job, factor: int, index: int) -> ShardWriter:
     """Return the writer of a shard of the frames (``factor`` 1) or of a binned level."""
     array = job.path / ("0" if factor == 1 else f"binned/{factor}")
     dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
-    return ShardWriter(shard_path(array, index), journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
+    place = chunk_path(array, index, 0, 0)
+    return ShardWriter(place, journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
 
 
 def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
@@ -255,7 +255,8 @@ def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> z
         chunks=grid.chunk,
         shards=grid.shard,
         dtype=dtype,
-        compressors=BloscCodec(**BLOSC[codec]) if codec in BLOSC else None,
+        compressors=codecs(codec),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
         dimension_names=AXES,
         zarr_format=3,

@@ -20,7 +20,7 @@ from .errors import MissingStoreError, StoreError
 from .journal import entries, journal_beside
 from .kernels.filters import Tiles
 from .ome import AXES
-from .shard_files import Grid, ShardReader, overlaps, shard_path
+from .shard_files import Grid, ShardReader, chunk_path, overlaps
 from .shards import Shard, Shards, split
 
 Frames: TypeAlias = NDArray[Any]
@@ -222,9 +222,9 @@ class Movie:
     def _shard(self, name: str, number: int) -> Iterator[ShardReader]:
         """Open a shard of the frames or of a binned level; what is wrong with it becomes a StoreError."""
         level = _open_level(self.path, self.key, name)
-        path = shard_path(self.path / name, number)
+        path = chunk_path(self.path / name, number, 0, 0, separator=level.separator)
         try:
-            with ShardReader(path, level.grid, level.dtype, encoded=level.encoded) as reader:
+            with ShardReader(path, level.grid, level.dtype, encoded=level.encoded, checked=level.checked) as reader:
                 yield reader
         except (OSError, ValueError) as error:
             shard = self.shards[number]
@@ -279,13 +279,18 @@ class _Level:
     grid: Grid
     dtype: np.dtype[Any]
     encoded: bool
+    checked: bool
+    separator: str
 
 
 @lru_cache(maxsize=32)
 def _open_level(path: Path, key: str, name: str) -> _Level:
     """Read how a level lies on disk, once in a process; the key tells a store from another later at the same place."""
     array: Any = stores.open_array(path / name)
-    return _Level(Grid(array.shape, array.chunks, array.shards), array.dtype, bool(array.compressors))
+    named = [codec.to_dict()["name"] for codec in array.compressors]
+    grid = Grid(array.shape, array.chunks, array.shards)
+    separator = array.metadata.chunk_key_encoding.separator
+    return _Level(grid, array.dtype, "blosc" in named, "crc32c" in named, separator)
 
 
 def _touched(boxes: NDArray[np.int64], shape: tuple[int, ...], tile: tuple[int, int]) -> NDArray[np.int64]:
