@@ -22,10 +22,10 @@ import zarr
 from distributed import Client
 from numpy.typing import NDArray
 
-from . import schema, stores
+from . import disk, schema, stores
 from .errors import DestinationError, SourceError
 from .io import FrameSource, SourceMetadata, open_cached, open_source
-from .journal import Journal, Payload, journal_beside
+from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
 from .ome import AXES, describe
@@ -98,7 +98,7 @@ def convert(
     same = present.get("kind") == "movie" and present.get("key") == key
     if same and present.get("complete"):
         update_metadata(path, known)
-        stores.remove(journal_beside(path))
+        remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
         on_event(StageDone(STAGE, time.perf_counter() - started, reused=True, summary="already converted"))
         return path
@@ -112,7 +112,7 @@ def convert(
             _clear(path)
             about = provenance(key, settings, movie.path) | {"format": movie.format}
             _create(path, layout, settings.codec, about, known)
-        journal = Journal(journal_beside(path), key)
+        journal = Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
     on_event(announce(done_frames=journal.frames_done(shards)))
     statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
 
@@ -121,7 +121,9 @@ def convert(
             values[shard.start : shard.stop] = payload[name]
 
     stream_shards(
-        partial(_convert_shard, _Job(_absolute(movie.path), source_settings, path, layout, settings.codec)),
+        partial(
+            _convert_shard, _Job(_absolute(movie.path), source_settings, path, journal.path, layout, settings.codec)
+        ),
         shards,
         keep,
         journal=journal,
@@ -165,6 +167,7 @@ class _Job:
     source: str
     source_settings: SourceSettings
     path: Path
+    aside: Path
     layout: Layout
     codec: str
 
@@ -220,7 +223,7 @@ def _writer(job: _Job, factor: int, index: int) -> ShardWriter:
     array = job.path / ("0" if factor == 1 else f"binned/{factor}")
     dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
     place = chunk_path(array, index, 0, 0)
-    return ShardWriter(place, journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
+    return ShardWriter(place, job.aside, job.layout.grid(factor), dtype, job.codec)
 
 
 def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
@@ -245,7 +248,7 @@ def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known
         "bins": layout.bins,
     }
     describe(aside, about | plan | _quantities(known))
-    aside.replace(path)
+    disk.place_folder(aside, path)
 
 
 def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> zarr.Array[Any]:
@@ -281,6 +284,7 @@ def _finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sou
     with stores.disk_errors(path):
         for name, values in statistics.items():
             zarr.open_array(str(path / name), mode="r+")[...] = values
+        disk.sync_folders(path, tuple(statistics))
         describe(path, stores.attributes(path) | _quantities(known) | {"complete": True})
 
 
@@ -320,7 +324,7 @@ def _is_zarr(folder: Path) -> bool:
 
 def _clear(path: Path) -> None:
     """Remove a store and its journal; renamed first, so that what is at ``path`` is always whole."""
-    stores.remove(journal_beside(path))
+    remove_journal(journal_beside(path))
     aside = path.with_name(f".{path.name}.removed")
     stores.remove(aside)
     if path.exists():

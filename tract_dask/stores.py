@@ -19,6 +19,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
+from . import disk
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
 
@@ -96,11 +97,11 @@ def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **c
 
 
 def write_aside(path: Path, data: bytes) -> None:
-    """Write a small file so that it is either whole or not there: beside its place first, then renamed."""
+    """Write a small file so that it is either whole or not there: beside its place first, synced, then renamed."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with disk_errors(path):
         aside.write_bytes(data)
-        aside.replace(path)
+        disk.place_now(aside, path)
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
@@ -112,7 +113,7 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         remove(aside)
         dataset.to_zarr(aside, mode="w", zarr_format=3, consolidated=False)
         remove(path)
-        aside.replace(path)
+        disk.place_folder(aside, path)
 
 
 def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:

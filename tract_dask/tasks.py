@@ -18,8 +18,8 @@ from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
 from numpy.typing import NDArray
 
-from .errors import ClusterError
-from .journal import Journal, Payload, entries
+from .errors import ClusterError, StoreError
+from .journal import Journal, Payload
 from .shards import Shard
 
 PATIENCE = "tract_dask.patience-s"
@@ -34,6 +34,12 @@ _SETTLE_S = 15.0
 
 _BATCH_S = 0.5
 """For so long a task goes on taking shards of its batch; a longer shard is a batch of its own."""
+
+_ROUNDS = 3
+"""So often shards are made that are not on disk afterwards."""
+
+_LOOK_AGAIN_S = (0.2, 1.0, 5.0, 30.0, 60.0)
+"""After such waits they are looked for again: network disks may show a file for so long as missing."""
 
 Numbers: TypeAlias = NDArray[np.int64]
 """Indices of shards."""
@@ -83,7 +89,8 @@ def stream_shards(
     """Run ``task`` on every shard that the journal does not know, and hand every payload to ``take``.
 
     On a cluster, shards that take little time go out several at once: a task takes them one by one, and notes each in
-    the journal, for about half a second.
+    the journal, for about half a second. In the end every shard is looked at on disk, and made again where it is not
+    as the journal says.
 
     Parameters
     ----------
@@ -104,20 +111,61 @@ def stream_shards(
     ------
     TractError
         The first error of a task; finished shards stay in the journal.
+    StoreError
+        Where a shard is not on disk though it was written, or another run has taken the place of this one.
     ClusterError
         Where workers die under a task again and again.
     """
-    missing = np.ones(len(shards), dtype=np.bool_)
-    for index, payload in entries(journal.path):
-        if missing[index]:
-            missing[index] = False
+    taken = np.zeros(len(shards), dtype=np.bool_)
+
+    def take_once(index: int, payload: Payload) -> None:
+        if not taken[index]:
+            taken[index] = True
             take(shards[index], payload)
-    todo = np.flatnonzero(missing)
+
     work = partial(_work, task, shards, journal)
-    with closing(_run_here(work, todo) if client is None else _run_on(client, work, todo, shards, name)) as finished:
-        for index, payload in finished:
-            take(shards[index], payload)
-            on_done(shards[index], payload)
+    todo = _missing(journal, shards, take_once)
+    for _ in range(_ROUNDS):
+        if not len(todo):
+            return
+        with closing(
+            _run_here(work, todo) if client is None else _run_on(client, work, todo, shards, name)
+        ) as finished:
+            for index, payload in finished:
+                take_once(index, payload)
+                on_done(shards[index], payload)
+        todo = _lost(journal, shards, take_once, patient=client is not None)
+    if len(todo):
+        raise StoreError(
+            f"{len(todo)} shards of stage {name} were written, and are not on disk as they were written",
+            str(journal.folder.parent),
+            "the files that the journal names",
+            f"none, or others, for frames {shards[todo[0]].start} to {shards[todo[0]].stop - 1}",
+            "Check this disk and its connection, and run again",
+        )
+
+
+def _missing(journal: Journal, shards: Sequence[Shard], take: Callable[[int, Payload], None]) -> Numbers:
+    """Hand on the payloads of the shards that are done, and on disk; return the others."""
+    missing = np.ones(len(shards), dtype=np.bool_)
+    for index, payload, _ in journal.sound(shards):
+        missing[index] = False
+        take(index, payload)
+    return np.flatnonzero(missing)
+
+
+def _lost(journal: Journal, shards: Sequence[Shard], take: Callable[[int, Payload], None], *, patient: bool) -> Numbers:
+    """Return which shards are not on disk, though all were reported done.
+
+    What another machine wrote can take a while to be seen on a network disk: a cluster's shards are looked for again.
+    """
+    lost = _missing(journal, shards, take)
+    for seconds in _LOOK_AGAIN_S if patient else ():
+        if not len(lost):
+            break
+        sleep(seconds)
+        lost = _missing(journal, shards, take)
+    return lost
 
 
 Work: TypeAlias = Callable[[Numbers], tuple[list[Payload], float]]
@@ -130,11 +178,12 @@ def _work(
     """Do the shards of a batch until its time is up; return the payloads of those that are done, and the seconds."""
     began = perf_counter()
     payloads = []
-    for index in batch.tolist():
-        payloads.append(task(shards[index]))
-        journal.record(shards[index], payloads[-1])
-        if perf_counter() - began > _BATCH_S:
-            break
+    with journal.batch() as done:
+        for index in batch.tolist():
+            payloads.append(task(shards[index]))
+            done(shards[index], payloads[-1])
+            if perf_counter() - began > _BATCH_S:
+                break
     return payloads, perf_counter() - began
 
 
