@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"journal", "provenance", "shards", "stores"}
+STORES = GROUND | {"damage", "journal", "provenance", "shards", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
@@ -21,7 +21,8 @@ ALLOWED = {
     "schema": {"errors"},
     "settings": {"errors"},
     "provenance": {"settings"},
-    "stores": {"errors", "schema"},
+    "stores": {"damage", "errors", "schema", "shard_files"},
+    "damage": {"errors"},
     "shards": set(),
     "journal": {"shards", "stores"},
     "tasks": {"errors", "journal", "shards"},
@@ -72,7 +73,7 @@ ALLOWED = {
     "certificates": {"errors"},
     "service": RUN
     | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
-    | {"meter", "report", "supervision", "terminal", "web"},
+    | {"meter", "report", "shard_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},

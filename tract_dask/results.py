@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import zarr
-from zarr.codecs import BloscCodec
 
 from . import schema, stores
 from .errors import MissingStoreError, SettingsError
 from .journal import entries, journal_beside
 from .schema import REJECTED, Status
 from .settings import FitSettings, from_toml
-from .shard_files import BLOSC, encode
+from .shard_files import CHUNK_KEYS, checksum, chunk_path, codecs, encode
 from .shards import Shard
 
 CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose")
@@ -72,7 +71,7 @@ def create(
     aside = path.with_name(f".{path.name}.partial")
     with stores.disk_errors(path):
         stores.remove(aside)
-        static.to_zarr(aside, mode="w", zarr_format=3, consolidated=False)
+        stores.write_arrays(static, aside)
         group = zarr.open_group(str(aside), mode="a")
         for variable in map(schema.RESULTS.__getitem__, SHARDED):
             shape = tuple(sizes[dim] for dim in variable.dims)
@@ -81,11 +80,13 @@ def create(
                 shape=shape,
                 chunks=(min(frames_per_shard, shape[0]), *shape[1:]),
                 dtype=variable.dtype,
-                compressors=BloscCodec(**BLOSC[_CODEC]),
+                compressors=codecs(_CODEC),
+                chunk_key_encoding=CHUNK_KEYS,
                 fill_value=variable.fill,
                 dimension_names=variable.dims,
                 attributes=variable.attributes,
             )
+        stores.seal(aside)
         stores.remove(path)
         aside.replace(path)
 
@@ -99,16 +100,16 @@ def write(path: Path, shard: Shard, values: dict[str, np.ndarray[Any, Any]], fra
         variable = schema.RESULTS[name]
         chunk = np.full((frames_per_shard, *array.shape[1:]), variable.fill, variable.dtype)
         chunk[: shard.frames] = array
-        place = path.joinpath(name, "c", str(shard.index), *["0"] * (array.ndim - 1))
+        place = chunk_path(path / name, shard.index, *[0] * (array.ndim - 1))
+        data = bytes(encode(chunk, _CODEC))
         with stores.disk_errors(path):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            stores.write_aside(place, bytes(encode(chunk, _CODEC)))
+            stores.write_aside(place, data + checksum(data))
 
 
 def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
     if any(stores.attributes(path).get(name) != value for name, value in about.items()):
-        zarr.open_array(str(path / "time"), mode="r+")[...] = time
+        stores.overwrite_array(path / "time", time)
         stores.update_attributes(path, plain=about, **about)
 
 
@@ -159,8 +160,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
             str(path),
             remedy="Run the same command again to finish, or open it with unfinished=True",
         )
-    with stores.codec_pipeline():
-        stored: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
+    stored = stores.open_lazily(path, partial=not about.get("complete"))
     if lacking := [name for name in (*schema.RESULTS, *schema.COLUMNS) if name not in stored]:
         raise MissingStoreError(
             "these results are of another version",

@@ -19,6 +19,7 @@ from ... import results, schema, stores
 from ...analysis import motion
 from ...errors import InputError, SettingsError
 from ...settings import FitSettings, from_toml, load, to_dict
+from ...shard_files import chunk_path
 from .pictures import as_json
 from .track_cache import QUANTITIES, open_tracks
 
@@ -340,7 +341,7 @@ def _stored_bytes(path: Path, done: NDArray[np.bool_]) -> int:
     shards = np.flatnonzero(done)
     some = shards[:: max(1, len(shards) // _SAMPLED)]
     files = (
-        path.joinpath(name, "c", str(shard), *["0"] * (len(schema.RESULTS[name].dims) - 1))
+        chunk_path(path / name, shard, *[0] * (len(schema.RESULTS[name].dims) - 1))
         for shard in some
         for name in results.SHARDED
     )
