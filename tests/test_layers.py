@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"disk", "journal", "provenance", "shards", "stores"}
+STORES = GROUND | {"damage", "disk", "journal", "provenance", "shards", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
@@ -22,7 +22,8 @@ ALLOWED = {
     "settings": {"errors"},
     "provenance": {"settings"},
     "disk": set(),
-    "stores": {"disk", "errors", "schema"},
+    "stores": {"damage", "disk", "errors", "schema", "shard_files"},
+    "damage": {"errors"},
     "shards": set(),
     "journal": {"disk", "errors", "shard_files", "shards", "stores"},
     "tasks": {"errors", "journal", "shards"},
@@ -74,7 +75,7 @@ ALLOWED = {
     "certificates": {"errors"},
     "service": RUN
     | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
-    | {"meter", "report", "supervision", "terminal", "web"},
+    | {"meter", "report", "shard_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},

@@ -299,7 +299,7 @@ def test_a_damaged_shard_is_named(tmp_path, source):
     movie = open_movie(convert(source, tmp_path / "movie.zarr", settings=SMALL))
     shard = movie.path / "0" / "c.1.0.0"
     shard.write_bytes(shard.read_bytes()[:-100])
-    with pytest.raises(StoreError, match=r"frames 3 to 5 cannot be read.*damaged"):
+    with pytest.raises(StoreError, match=r"frames 3 to 5 are damaged"):
         movie.read(3, 6)
     movie.read(0, 3)
 

@@ -67,7 +67,7 @@ def test_a_tile_that_is_not_stored_is_an_error(tmp_path):
     out = np.empty((3, 30, 44), np.uint16)
     with (
         reader(tmp_path / "0", 1, "u2", "lz4") as shard,
-        pytest.raises(ValueError, match=r"tile \(0, 0, 0\) of .* is missing"),
+        pytest.raises(ValueError, match=r"tile \(0, 0, 0\) is missing"),
     ):
         shard.read((slice(0, 3), slice(0, 30), slice(0, 44)), out)
 

@@ -96,6 +96,8 @@ def convert(
 
     present = stores.attributes(path)
     same = present.get("kind") == "movie" and present.get("key") == key
+    if not present.get("complete"):
+        same &= present.get("format") == stores.FORMAT  # shards of an older format do not go with ours
     if same and present.get("complete"):
         update_metadata(path, known)
         remove_journal(journal_beside(path))
@@ -272,6 +274,8 @@ def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: d
         shape=(length,),
         chunks=(length,),
         dtype=dtype,
+        compressors=codecs("zstd"),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
         dimension_names=(axis,),
         attributes=attributes,
@@ -283,7 +287,7 @@ def _finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sou
     """Write the statistics (frames,) and the metadata, and say that the store is complete."""
     with stores.disk_errors(path):
         for name, values in statistics.items():
-            zarr.open_array(str(path / name), mode="r+")[...] = values
+            stores.overwrite_array(path / name, values)
         disk.sync_folders(path, tuple(statistics))
         describe(path, stores.attributes(path) | _quantities(known) | {"complete": True})
 

@@ -16,6 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from . import schema, stores
+from .damage import reading
 from .errors import MissingStoreError, StoreError
 from .journal import entries, journal_beside
 from .kernels.filters import Tiles
@@ -186,9 +187,7 @@ class Movie:
 
     def statistics(self) -> xr.Dataset:
         """Return the per-frame statistics (``schema.STATISTICS``) on ``t``, in memory."""
-        store = xr.open_zarr(self.path, consolidated=False, chunks=None)
-        statistics: xr.Dataset = store[list(schema.STATISTICS)].load()
-        return statistics
+        return stores.open_dataset(self.path, only=tuple(schema.STATISTICS))
 
     @property
     def frames(self) -> xr.DataArray:
@@ -203,7 +202,7 @@ class Movie:
             inline_array=True,
             fancy=False,
         )
-        store = xr.open_zarr(self.path, consolidated=False, chunks=None)
+        store = stores.open_dataset(self.path, only=AXES)
         known = {name: getattr(self, name) for name in schema.CALIBRATION}
         attributes = {name: value for name, value in known.items() if value is not None}
         return xr.DataArray(pixels, {axis: store[axis] for axis in AXES}, AXES, "movie", attributes)
@@ -223,17 +222,11 @@ class Movie:
         """Open a shard of the frames or of a binned level; what is wrong with it becomes a StoreError."""
         level = _open_level(self.path, self.key, name)
         path = chunk_path(self.path / name, number, 0, 0, separator=level.separator)
-        try:
-            with ShardReader(path, level.grid, level.dtype, encoded=level.encoded, checked=level.checked) as reader:
-                yield reader
-        except (OSError, ValueError) as error:
-            shard = self.shards[number]
-            raise StoreError(
-                f"frames {shard.start} to {shard.stop - 1} cannot be read",
-                str(path),
-                got=str(error),
-                remedy="The shard is damaged: remove the store and convert the movie again",
-            ) from error
+        with (
+            reading(path),
+            ShardReader(path, level.grid, level.dtype, encoded=level.encoded, checked=level.checked) as reader,
+        ):
+            yield reader
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import xarray as xr
 import zarr
 
 from . import disk, schema, stores
-from .errors import MissingStoreError, SettingsError, StoreError
+from .errors import MissingStoreError, SettingsError
 from .journal import Journal, journal_beside
 from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined
 from .schema import REJECTED, Status
@@ -75,7 +75,7 @@ def create(
     per_file = _per_file(-(-len(time) // step), 8 * step * sizes["column_id"] * sizes["parameter"])
     with stores.disk_errors(path):
         stores.remove(aside)
-        static.to_zarr(aside, mode="w", zarr_format=3, consolidated=False)
+        stores.write_arrays(static, aside)
         group = zarr.open_group(str(aside), mode="a")
         for variable in map(schema.RESULTS.__getitem__, SHARDED):
             shape = tuple(sizes[dim] for dim in variable.dims)
@@ -91,6 +91,7 @@ def create(
                 dimension_names=variable.dims,
                 attributes=variable.attributes,
             )
+        stores.seal(aside)
         stores.remove(path)
         disk.place_folder(aside, path)
 
@@ -117,7 +118,7 @@ def finish(path: Path, **about: Any) -> None:
 def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
     if any(stores.attributes(path).get(name) != value for name, value in about.items()):
-        zarr.open_array(str(path / "time"), mode="r+")[...] = time
+        stores.overwrite_array(path / "time", time)
         stores.update_attributes(path, plain=about, **about)
 
 
@@ -160,8 +161,7 @@ def growing_files(path: Path) -> list[tuple[Path, Iterator[bytes]]]:
     parts = _parts(path)
     if parts is None:
         return []
-    fit = stores.open_array(path / "fit")
-    per_file, found = fit.shards[0] // fit.chunks[0], []
+    per_file, found = parts.per_file, []
     for number, start in enumerate(range(0, len(parts.done), per_file)):
         shards = range(start, min(start + per_file, len(parts.done)))
         if parts.done[shards].any():
@@ -191,26 +191,6 @@ def _parts(path: Path) -> Parts | None:
     return Parts.of(journal, fit.shape[0], fit.chunks[0])
 
 
-def check_files(path: Path) -> None:
-    """Check that every file of the variables is there: readers take one that is missing for values not known.
-
-    Raises
-    ------
-    StoreError
-        Naming the first that is missing.
-    """
-    for name in SHARDED:
-        array = stores.open_array(path / name)
-        for number in range(-(-array.shape[0] // array.shards[0]) if array.shards else 0):
-            file = chunk_path(path / name, number, *file_place(name))
-            if not file.exists():
-                raise StoreError(
-                    "a file of the results is missing",
-                    str(file),
-                    remedy="Restore it from a copy, or remove the store and run the same command again",
-                )
-
-
 def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     """Return the tracks at ``path`` as a lazy Dataset over (frame, column_id, parameter).
 
@@ -236,8 +216,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
             str(path),
             remedy="Run the same command again to finish, or open it with unfinished=True",
         )
-    with stores.codec_pipeline():
-        stored: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
+    stored = stores.open_lazily(path, partial=not about.get("complete"))
     if lacking := [name for name in (*schema.RESULTS, *schema.COLUMNS) if name not in stored]:
         raise MissingStoreError(
             "these results are of another version",
@@ -249,9 +228,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
     dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
-    if about.get("complete"):
-        check_files(path)
-    else:
+    if not about.get("complete"):
         dataset = _grown(dataset, path)
     dataset.attrs |= {name: about.get(name) for name in CALIBRATION}
     settings = from_toml(FitSettings, about["settings"], str(path))

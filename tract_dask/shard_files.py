@@ -257,7 +257,7 @@ class ShardReader:
             self._index = index.reshape(*self._grid.tiles, 2)
         except ValueError as error:
             self._file.close()
-            raise ValueError(f"the index at the end of {self._path} is damaged") from error
+            raise ValueError("the index at the end is damaged") from error
         lengths = self._index[..., 1]
         self._stored = memoryview(bytearray(int(lengths.max(where=lengths != _ABSENT, initial=0))))
         return self
@@ -269,13 +269,13 @@ class ShardReader:
         """Decode a tile into ``out``, contiguous and as large as a tile."""
         offset, length = self._index[layer, row, column].tolist()
         if offset == _ABSENT:
-            raise ValueError(f"tile {layer, row, column} of {self._path} is missing")
+            raise ValueError(f"tile {layer, row, column} is missing")
         try:
             count = os.preadv(self._file.fileno(), [self._stored[:length]], offset)
             data = self._stored[:count]
             decode(unchecked(data) if self._checked else data, out, encoded=self._encoded)
         except ValueError as error:
-            raise ValueError(f"tile {layer, row, column} of {self._path} is damaged: {error}") from error
+            raise ValueError(f"tile {layer, row, column} is damaged: {error}") from error
 
     def read(self, part: tuple[slice, slice, slice], out: Pixels) -> None:
         """Decode a part of the shard, its frames, rows and columns, into ``out``."""
