@@ -169,6 +169,8 @@ def fit_movie(
         name="fit",
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
+        file=str(movie.path),
+        on_event=on_event,
     )
     stores.update_attributes(path, complete=True, summary=summary)
     journal.remove()
