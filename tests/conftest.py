@@ -166,7 +166,7 @@ def add_fits(
 def store_fits(path: Path, values: dict[str, np.ndarray], step: int, key: str = "key") -> None:
     """Store the fits of all frames in the results at ``path``, which are complete then."""
     journal = add_fits(path, values, split(len(values["fit"]), step), step, key)
-    parts.join(path, journal, None)
+    parts.join(path, journal)
     results.finish(path)
     journal.remove()
 

@@ -74,7 +74,7 @@ ALLOWED = {
     "console": {"options"},
     "certificates": {"errors"},
     "service": RUN
-    | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
+    | {"parts", "analysis", "certificates", "describe", "export", "forkserver", "lazy"}
     | {"meter", "report", "shard_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},

@@ -132,6 +132,8 @@ def convert(
         name=STAGE,
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone(STAGE, shard.index, shard.frames)),
+        file=movie.path,
+        on_event=on_event,
     )
     _finalise(path, statistics, known)
     journal.remove()

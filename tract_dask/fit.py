@@ -163,7 +163,7 @@ def fit_movie(
     for attempt in range(_ATTEMPTS):
         summary = _fit_shards(movie, path, journal, client, on_event)
         try:
-            join(path, journal, client, attempt)
+            join(path, journal, client, on_event, attempt)
             break
         except DamagedPartError as error:
             if attempt == _ATTEMPTS - 1:
@@ -193,6 +193,8 @@ def _fit_shards(movie: Movie, path: Path, journal: Journal, client: Client | Non
         name="fit",
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
+        file=str(movie.path),
+        on_event=on_event,
     )
     return summary
 

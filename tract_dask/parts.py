@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from . import disk, schema, stores
 from .errors import StoreError
 from .journal import GROWING, Journal, Payload, own_file
+from .progress import Sink, silent
 from .shard_files import CHECKSUM_BYTES, checksum, chunk_path, decode, encode, unchecked
 from .shards import Shard, split
 from .tasks import stream_shards
@@ -125,7 +126,8 @@ class Parts:
     @staticmethod
     def _lengths(handle: int, index: int, end: int) -> list[int]:
         tail = os.pread(handle, _TAIL_BYTES, max(0, end - _TAIL_BYTES))
-        own, *lengths = np.frombuffer(unchecked(memoryview(tail)), "<u8").tolist()
+        numbers: list[int] = np.frombuffer(unchecked(memoryview(tail)), "<u8").tolist()
+        own, *lengths = numbers
         if own != index or sum(lengths) > end:
             raise ValueError("this is the part of another shard")
         return lengths
@@ -184,7 +186,8 @@ class Growing:
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the values."""
-        return np.dtype(self.array.dtype)
+        dtype: np.dtype[Any] = self.array.dtype
+        return dtype
 
     @property
     def chunks(self) -> tuple[int, ...]:
@@ -226,7 +229,13 @@ class _Joining:
     attempt: int
 
 
-def join(path: Path, journal: Journal, client: Client | None, attempt: int = 0) -> None:
+def layout(path: Path) -> tuple[int, int, int]:
+    """Return the frames of the store at ``path``, those of a shard of the movie, and the shards that share a file."""
+    fit: Any = stores.open_array(path / "fit")
+    return fit.shape[0], fit.chunks[0], (fit.shards or fit.chunks)[0] // fit.chunks[0]
+
+
+def join(path: Path, journal: Journal, client: Client | None = None, on_event: Sink = silent, attempt: int = 0) -> None:
     """Join the parts of all shards into the files of the store at ``path``.
 
     It has a journal of its own, inside that of the fits: what an earlier call has joined is kept.
@@ -241,16 +250,25 @@ def join(path: Path, journal: Journal, client: Client | None, attempt: int = 0) 
     DamagedPartError
         Where parts are damaged: fit their shards again, then call this again.
     """
-    fit = stores.open_array(path / "fit")
-    files, step = split(fit.shape[0], fit.shards[0]), fit.chunks[0]
+    n_frames, step, per_file = layout(path)
+    files = split(n_frames, step * per_file)
     own = Journal(journal.path / "files", journal.key)
-    job = _Joining(path, journal, own.path, fit.shape[0], step, fit.shards[0] // step, attempt)
+    job = _Joining(path, journal, own.path, n_frames, step, per_file, attempt)
     if len(files) <= _AT_ONCE:
         client = None
     try:
-        stream_shards(partial(_join_task, job), files, _nothing, journal=own, name="fit", client=client)
+        stream_shards(
+            partial(_join_task, job),
+            files,
+            _nothing,
+            journal=own,
+            name="fit",
+            client=client,
+            file=str(path),
+            on_event=on_event,
+        )
     except DamagedPartError:
-        Parts.of(journal, fit.shape[0], step).strike_damaged()
+        Parts.of(journal, n_frames, step).strike_damaged()
         raise
 
 

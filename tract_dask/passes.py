@@ -62,7 +62,16 @@ class Passes:
             self._computed = True
             self.on_event(ShardDone(self.name, shard.index, shard.frames))
 
-        return run_shards(task, shards, journal=journal, name=self.name, client=self.client, on_done=tell)
+        return run_shards(
+            task,
+            shards,
+            journal=journal,
+            name=self.name,
+            client=self.client,
+            on_done=tell,
+            file=str(self.movie.path),
+            on_event=self.on_event,
+        )
 
     def end(self, summary: str) -> None:
         """Tell that the stage is done."""

@@ -19,7 +19,7 @@ import zarr
 from . import disk, schema, stores
 from .errors import MissingStoreError, SettingsError
 from .journal import Journal, journal_beside
-from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined
+from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
 from .schema import REJECTED, Status
 from .settings import FitSettings, from_toml
 from .shard_files import CHUNK_KEYS, chunk_path, codecs
@@ -133,8 +133,8 @@ def finished_shards(path: Path) -> np.ndarray[Any, np.dtype[np.bool_]]:
     parts = _parts(path)
     if parts is not None:
         return parts.done
-    fit = stores.open_array(path / "fit")
-    return np.full(-(-fit.shape[0] // fit.chunks[0]), bool(stores.attributes(path).get("complete")))
+    n_frames, step, _ = layout(path)
+    return np.full(-(-n_frames // step), bool(stores.attributes(path).get("complete")))
 
 
 def variables(path: Path) -> Callable[[str], Any]:
@@ -161,7 +161,8 @@ def growing_files(path: Path) -> list[tuple[Path, Iterator[bytes]]]:
     parts = _parts(path)
     if parts is None:
         return []
-    per_file, found = parts.per_file, []
+    _, _, per_file = layout(path)
+    found = []
     for number, start in enumerate(range(0, len(parts.done), per_file)):
         shards = range(start, min(start + per_file, len(parts.done)))
         if parts.done[shards].any():
@@ -187,8 +188,8 @@ def _parts(path: Path) -> Parts | None:
     journal = None if about.get("complete") else Journal.existing(journal_beside(path), str(about.get("key")))
     if journal is None:
         return None
-    fit = stores.open_array(path / "fit")
-    return Parts.of(journal, fit.shape[0], fit.chunks[0])
+    n_frames, step, _ = layout(path)
+    return Parts.of(journal, n_frames, step)
 
 
 def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:

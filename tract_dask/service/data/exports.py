@@ -11,7 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from ...export import export
-from ...results import SHARDED, growing_files
+from ...parts import SHARDED
+from ...results import growing_files
 from .tracks import open_finished
 from .workshop import Workshop
 
