@@ -62,6 +62,7 @@ ALLOWED = {
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
+    "verify": STORES | {"conversion", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
     "pipeline": STAGES | {"cluster", "report", "stages"},
@@ -81,7 +82,7 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
+    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal", "verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

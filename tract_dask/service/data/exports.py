@@ -85,7 +85,7 @@ def zipped(results: Path) -> Iterator[bytes]:
             parts = inside.split("/")
             if any(part.startswith(".") for part in parts) or not path.is_file():
                 continue
-            if parts[0] in SHARDED and parts[1] == "c" and parts[2] in unfinished:
+            if parts[0] in SHARDED and parts[1].startswith("c.") and parts[1].split(".")[1] in unfinished:
                 continue
             with path.open("rb") as source, archive.open(_entry(path, inside), "w") as target:
                 while piece := source.read(_PIECE):
