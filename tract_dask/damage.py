@@ -21,9 +21,6 @@ from zarr.storage import LocalStore, StorePath
 
 from .errors import StoreError
 
-ATTRIBUTE = "tract_dask"
-"""Name of the attribute under which every store keeps its provenance and its own metadata."""
-
 METADATA = "zarr.json"
 
 FRAME_AXES = ("t", "frame")

@@ -19,10 +19,13 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from .damage import ATTRIBUTE, CHECKED, METADATA, damaged, read_json, reading
+from .damage import CHECKED, METADATA, damaged, read_json, reading
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
 from .shard_files import CHUNK_KEYS, crc32c
+
+ATTRIBUTE = "tract_dask"
+"""Name of the attribute under which every store keeps its provenance and its own metadata."""
 
 FORMAT = 2
 """Number of the format in which stores are written. In format 1 chunks had no checksums, and stores no number."""
