@@ -22,10 +22,10 @@ import zarr
 from distributed import Client
 from numpy.typing import NDArray
 
-from . import schema, stores
+from . import disk, schema, stores
 from .errors import DestinationError, SourceError
 from .io import FrameSource, SourceMetadata, open_cached, open_source
-from .journal import Journal, Payload, journal_beside
+from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
 from .ome import AXES, describe
@@ -100,7 +100,7 @@ def convert(
         same &= stores.format_of(present) == stores.FORMAT  # shards of an older format do not go with ours
     if same and present.get("complete"):
         update_metadata(path, known)
-        stores.remove(journal_beside(path))
+        remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
         on_event(StageDone(STAGE, time.perf_counter() - started, reused=True, summary="already converted"))
         return path
@@ -115,7 +115,7 @@ def convert(
             about = provenance(key, settings, movie.path) | {"source_format": movie.format}
             about["source_settings"] = to_toml(source_settings)
             _create(path, layout, settings.codec, about, known)
-        journal = Journal(journal_beside(path), key)
+        journal = Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
     on_event(announce(done_frames=journal.frames_done(shards)))
     statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
 
@@ -124,13 +124,17 @@ def convert(
             values[shard.start : shard.stop] = payload[name]
 
     stream_shards(
-        partial(_convert_shard, _Job(_absolute(movie.path), source_settings, path, layout, settings.codec)),
+        partial(
+            _convert_shard, _Job(_absolute(movie.path), source_settings, path, journal.path, layout, settings.codec)
+        ),
         shards,
         keep,
         journal=journal,
         name=STAGE,
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone(STAGE, shard.index, shard.frames)),
+        file=movie.path,
+        on_event=on_event,
     )
     _finalise(path, statistics, known)
     journal.remove()
@@ -167,16 +171,13 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
         )
     layout = plan_layout(source.shape, source.dtype, settings)
     chosen = [shard for shard in split(layout.shape[0], layout.frames_per_shard) if everything or shard.index in shards]
-    job = _Job(_absolute(source.path), declared, path, layout, settings.codec)
-    on_event(
-        StageStarted(
-            STAGE,
-            sum(shard.frames for shard in chosen),
-            frame_bytes=math.prod(layout.shape[1:]) * layout.dtype.itemsize,
-        )
-    )
+    aside = path.with_name(f".{path.name}.repair")
+    stores.remove(aside)
+    aside.mkdir()
+    job = _Job(_absolute(source.path), declared, path, aside, layout, settings.codec)
+    frame_bytes = math.prod(layout.shape[1:]) * layout.dtype.itemsize
+    on_event(StageStarted(STAGE, sum(shard.frames for shard in chosen), frame_bytes=frame_bytes))
     started = time.perf_counter()
-    journal_beside(path).mkdir(exist_ok=True)
     statistics = {name: np.empty(layout.shape[0]) for name in schema.STATISTICS}
     for shard in chosen:
         for name, values in _convert_shard(job, shard).items():
@@ -184,7 +185,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
         on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
         _finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
-    stores.remove(journal_beside(path))
+    stores.remove(aside)
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made anew"))
 
 
@@ -218,6 +219,7 @@ class _Job:
     source: str
     source_settings: SourceSettings
     path: Path
+    aside: Path
     layout: Layout
     codec: str
 
@@ -273,7 +275,7 @@ def _writer(job: _Job, factor: int, index: int) -> ShardWriter:
     array = job.path / ("0" if factor == 1 else f"binned/{factor}")
     dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
     place = chunk_path(array, index, 0, 0)
-    return ShardWriter(place, journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
+    return ShardWriter(place, job.aside, job.layout.grid(factor), dtype, job.codec)
 
 
 def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
@@ -298,7 +300,7 @@ def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known
         "bins": layout.bins,
     }
     describe(aside, about | plan | _quantities(known))
-    aside.replace(path)
+    disk.place_folder(aside, path)
 
 
 def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> zarr.Array[Any]:
@@ -336,6 +338,7 @@ def _finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sou
     with stores.disk_errors(path):
         for name, values in statistics.items():
             stores.overwrite_array(path / name, values)
+        disk.sync_folders(path, tuple(statistics))
         describe(path, stores.attributes(path) | _quantities(known) | {"complete": True})
 
 
@@ -375,7 +378,7 @@ def _is_zarr(folder: Path) -> bool:
 
 def _clear(path: Path) -> None:
     """Remove a store and its journal; renamed first, so that what is at ``path`` is always whole."""
-    stores.remove(journal_beside(path))
+    remove_journal(journal_beside(path))
     aside = path.with_name(f".{path.name}.removed")
     stores.remove(aside)
     if path.exists():

@@ -100,6 +100,8 @@ def frames_in(file: Path) -> tuple[int, int] | None:
 def remedy(file: Path) -> str:
     """Return what makes a damaged store whole again, as a sentence without its full stop."""
     store, again = store_of(file), "run the command that wrote it again"
+    if any(folder.name.endswith(".zarr.journal") for folder in file.parents):
+        return "Run the same command again: it makes anew what is damaged"
     if file.name != METADATA and (store / "frame_bad_pixels").exists():  # a movie
         return f"tract-dask verify {store} --repair makes it anew from the source of the movie"
     if (store / "status_ref").exists() and not (store / "fit").exists():

@@ -12,6 +12,7 @@ import math
 import os
 import uuid
 from collections.abc import Iterator
+from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +22,8 @@ import google_crc32c
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
+
+from . import disk
 
 Pixels = NDArray[Any]
 
@@ -147,8 +150,9 @@ def decode(data: memoryview, out: Pixels, *, encoded: bool) -> None:
 class ShardWriter:
     """Writes one shard, frame by frame: aside first; in its place once the block of the ``with`` statement is over.
 
-    Neither a killed task nor a second copy of it can leave a shard that is half written. Frames are laid into the tiles
-    of the current layer, which are encoded once the layer is full, or the movie ends.
+    In an open batch (:func:`tract_dask.disk.together`) it is there once that is committed. Neither a killed task nor a
+    second copy of it can leave a shard that is half written. Frames are laid into the tiles of the current layer, which
+    are encoded once the layer is full, or the movie ends.
 
     Parameters
     ----------
@@ -185,15 +189,14 @@ class ShardWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
+        with ExitStack() as stack:
+            stack.callback(self._aside.unlink, missing_ok=True)
             with self._file:
-                if error is None:
-                    self._finish()
-            if error is None:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._aside.replace(self._path)
-        finally:
-            self._aside.unlink(missing_ok=True)
+                if error is not None:
+                    return
+                self._finish()
+            disk.place(self._aside, self._path)
+            stack.pop_all()
 
     def _finish(self) -> None:
         """Write the layer that the movie's end leaves unfinished, filled up with zeros, and the index."""
@@ -205,11 +208,13 @@ class ShardWriter:
         self._write(index, checksum(index))
 
     def _encode(self, layer: int) -> None:
+        began = self._offset
         for row, column in np.ndindex(self._layer.shape[:2]):
             data = encode(self._layer[row, column], self._codec, self._encoded)
             offset = self._offset
             self._write(data, checksum(data))
             self._index[layer, row, column] = offset, self._offset - offset
+        disk.write_back(self._file.fileno(), began, self._offset - began)
 
     def _write(self, data: Any, behind: bytes) -> None:
         """Write data and what stands behind them: one call of the system may take less."""

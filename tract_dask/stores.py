@@ -19,6 +19,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from . import disk
 from .damage import CHECKED, METADATA, damaged, read_json, reading
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
@@ -227,11 +228,11 @@ def _opening(path: Path) -> Iterator[None]:
 
 
 def write_aside(path: Path, data: bytes) -> None:
-    """Write a small file so that it is either whole or not there: beside its place first, then renamed."""
+    """Write a small file so that it is either whole or not there: beside its place first, synced, then renamed."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with disk_errors(path):
         aside.write_bytes(data)
-        aside.replace(path)
+        disk.place_now(aside, path)
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
@@ -242,7 +243,7 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         write_arrays(dataset, aside)
         seal(aside)
         remove(path)
-        aside.replace(path)
+        disk.place_folder(aside, path)
 
 
 def write_arrays(dataset: xr.Dataset, path: Path) -> None:

@@ -18,6 +18,8 @@ from . import stores
 from .conversion import remake
 from .damage import FRAME_AXES, METADATA, remedy
 from .errors import MissingStoreError, StoreError
+from .journal import Journal, journal_beside
+from .parts import SHARDED, Parts, layout
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .shard_files import ABSENT, read_index, unchecked
 
@@ -207,6 +209,8 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
             if frames:
                 on_event(ShardDone(store.name, 0, frames[1] - frames[0]))
             faults += [fault] if fault else []
+    if stage == "fit" and not about.get("complete"):
+        faults += _damaged_parts(store, str(about.get("key")))
     bad = sum(fault.what != "left over" for fault in faults)
     on_event(StageDone(store.name, perf_counter() - began, summary=f"{bad} faults" if bad else "sound"))
     plain = stores.format_of(about) < stores.FORMAT
@@ -216,6 +220,25 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
         () if about.get("complete", True) else (store,),
         (store,) if plain else (),
     )
+
+
+def _damaged_parts(store: Path, key: str) -> list[Fault]:
+    """Check what is fitted of results that are not complete."""
+    journal = Journal.existing(journal_beside(store), key)
+    if journal is None:
+        return []
+    n_frames, step, _ = layout(store)
+    parts, faults = Parts.of(journal, n_frames, step), []
+    for index in np.flatnonzero(parts.done).tolist():
+        fault = Fault(parts.file(index), store, "fit", "damaged", "", (index * step, min(n_frames, (index + 1) * step)))
+        try:
+            for name in SHARDED:
+                parts.stored(index, name)
+        except OSError as error:
+            faults.append(dataclasses.replace(fault, what="unreadable", why=error.strerror or str(error)))
+        except ValueError as error:
+            faults.append(dataclasses.replace(fault, why=str(error)))
+    return faults
 
 
 def _fault(error: StoreError, file: Path, store: Path, stage: str) -> Fault:
