@@ -127,6 +127,8 @@ class _Whole:
         found: Buffer | None = await self.inner.get(prototype, byte_range)
         if found is None:
             raise _MissingError("no such file")
+        if not len(found):  # for Zarr an empty shard is one without tiles
+            raise ValueError("the file is empty, or ends too early")
         return found
 
 
