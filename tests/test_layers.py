@@ -64,6 +64,7 @@ ALLOWED = {
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
+    "verify": STORES | {"conversion", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
     "pipeline": STAGES | {"cluster", "report", "stages"},
@@ -83,7 +84,7 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
+    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal", "verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

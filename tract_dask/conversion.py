@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
 from .ome import AXES, describe
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import fingerprint, provenance, stage_key
-from .settings import ConvertSettings, MetadataSettings, SourceSettings
+from .settings import ConvertSettings, MetadataSettings, SourceSettings, from_toml, to_toml
 from .shard_files import CHUNK_KEYS, Grid, ShardWriter, chunk_path, codecs
 from .shards import Shard, split
 from .tasks import stream_shards
@@ -97,7 +97,7 @@ def convert(
     present = stores.attributes(path)
     same = present.get("kind") == "movie" and present.get("key") == key
     if not present.get("complete"):
-        same &= present.get("format") == stores.FORMAT  # shards of an older format do not go with ours
+        same &= stores.format_of(present) == stores.FORMAT  # shards of an older format do not go with ours
     if same and present.get("complete"):
         update_metadata(path, known)
         remove_journal(journal_beside(path))
@@ -112,7 +112,8 @@ def convert(
     with stores.disk_errors(path):
         if not same:
             _clear(path)
-            about = provenance(key, settings, movie.path) | {"format": movie.format}
+            about = provenance(key, settings, movie.path) | {"source_format": movie.format}
+            about["source_settings"] = to_toml(source_settings)
             _create(path, layout, settings.codec, about, known)
         journal = Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
     on_event(announce(done_frames=journal.frames_done(shards)))
@@ -139,6 +140,53 @@ def convert(
     journal.remove()
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
     return path
+
+
+def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_event: Sink = silent) -> None:
+    """Make some shards of a complete movie anew from its source, in this process.
+
+    Parameters
+    ----------
+    shards
+        Their indices.
+    everything
+        Make all shards, and the statistics and coordinates too.
+
+    Raises
+    ------
+    SourceError
+        Where the source is not there, or is not what the movie was made from.
+    """
+    about = stores.attributes(path)
+    settings = from_toml(ConvertSettings, about["settings"], str(path))
+    declared = from_toml(SourceSettings, about["source_settings"], str(path))
+    source = open_source(about["source"], declared)
+    if movie_key(source, settings, declared) != about["key"]:
+        raise SourceError(
+            "the source is not what the movie was made from",
+            source.path,
+            "the same file",
+            "another one",
+            f"Remove {path}, and convert what you have",
+        )
+    layout = plan_layout(source.shape, source.dtype, settings)
+    chosen = [shard for shard in split(layout.shape[0], layout.frames_per_shard) if everything or shard.index in shards]
+    aside = path.with_name(f".{path.name}.repair")
+    stores.remove(aside)
+    aside.mkdir()
+    job = _Job(_absolute(source.path), declared, path, aside, layout, settings.codec)
+    frame_bytes = math.prod(layout.shape[1:]) * layout.dtype.itemsize
+    on_event(StageStarted(STAGE, sum(shard.frames for shard in chosen), frame_bytes=frame_bytes))
+    started = time.perf_counter()
+    statistics = {name: np.empty(layout.shape[0]) for name in schema.STATISTICS}
+    for shard in chosen:
+        for name, values in _convert_shard(job, shard).items():
+            statistics[name][shard.start : shard.stop] = values
+        on_event(ShardDone(STAGE, shard.index, shard.frames))
+    if everything:
+        _finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
+    stores.remove(aside)
+    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made anew"))
 
 
 def movie_key(

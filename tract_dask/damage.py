@@ -21,9 +21,6 @@ from zarr.storage import LocalStore, StorePath
 
 from .errors import StoreError
 
-ATTRIBUTE = "tract_dask"
-"""Name of the attribute under which every store keeps its provenance and its own metadata."""
-
 METADATA = "zarr.json"
 
 FRAME_AXES = ("t", "frame")
@@ -35,7 +32,7 @@ def damaged(file: Path, why: str, kind: str = "is damaged") -> StoreError:
     frames = frames_in(file)
     what = f"frames {frames[0]} to {frames[1] - 1}" if frames else "this part of the store"
     verb = kind.replace("is ", "are ", 1) if frames else kind
-    return StoreError(f"{what} {verb}", str(file), got=why, remedy=remedy(store_of(file)))
+    return StoreError(f"{what} {verb}", str(file), got=why, remedy=remedy(file))
 
 
 def unreadable(file: Path, error: OSError) -> StoreError:
@@ -75,7 +72,7 @@ def read_json(file: Path) -> dict[str, Any]:
         raise unreadable(file, error) from error
     except (ValueError, RecursionError) as error:
         raise damaged(file, str(error)) from error
-    if not isinstance(found, dict) or not isinstance(found.get("attributes", {}), dict) or "zarr_format" not in found:
+    if not isinstance(found, dict) or not isinstance(found.get("attributes", {}), dict):
         raise damaged(file, "no metadata of Zarr")
     return found
 
@@ -100,15 +97,20 @@ def frames_in(file: Path) -> tuple[int, int] | None:
     return (number * step, min(length, (number + 1) * step)) if in_frames else None
 
 
-def remedy(store: Path) -> str:
-    """Return what makes a damaged store whole again."""
-    again = "run the command that wrote it again"
-    if store.name == "columns.zarr":
+def remedy(file: Path) -> str:
+    """Return what makes a damaged store whole again, as a sentence without its full stop."""
+    store, again = store_of(file), "run the command that wrote it again"
+    if any(folder.name.endswith(".zarr.journal") for folder in file.parents):
+        return "Run the same command again: it makes anew what is damaged"
+    if file.name != METADATA and (store / "frame_bad_pixels").exists():  # a movie
+        return f"tract-dask verify {store} --repair makes it anew from the source of the movie"
+    if (store / "status_ref").exists() and not (store / "fit").exists():
+        table = store.with_suffix(".csv")
         return (
-            f"Remove {store}, move columns.csv beside it elsewhere, and {again}; give the table with --columns if you "
-            "had edited it"
+            f"Remove {store}, move {table.name} beside it elsewhere, and {again}; give the table with --columns if you "
+            "have edited it"
         )
-    return f"Remove {store} and {again}: what depends on it alone is made anew"
+    return f"Remove {store} and {again}: nothing else is made anew"
 
 
 class _MissingError(ValueError):
@@ -125,6 +127,8 @@ class _Whole:
         found: Buffer | None = await self.inner.get(prototype, byte_range)
         if found is None:
             raise _MissingError("no such file")
+        if not len(found):  # for Zarr an empty shard is one without tiles
+            raise ValueError("the file is empty, or ends too early")
         return found
 
 

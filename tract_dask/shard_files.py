@@ -28,7 +28,9 @@ from . import disk
 Pixels = NDArray[Any]
 
 _blosc: Any = imagecodecs  # its annotations leave out arrays, which it takes
-_ABSENT = np.uint64(2**64 - 1)
+ABSENT = 2**64 - 1
+"""Offset and length of a tile that is not stored."""
+
 CHECKSUM_BYTES = 4
 """Bytes of a CRC-32C, behind the data that it is of."""
 
@@ -164,7 +166,7 @@ class ShardWriter:
         self._path, self._aside, self._codec = path, aside / f"{uuid.uuid4().hex}.partial", codec
         layers, rows, columns = grid.tiles
         depth, height, width = grid.chunk
-        self._index = np.full((layers, rows, columns, 2), _ABSENT, "<u8")
+        self._index = np.full((layers, rows, columns, 2), ABSENT, "<u8")
         self._layer = np.zeros((rows, columns, depth, height, width), dtype)
         self._encoded = np.empty(self._layer[0, 0].nbytes + _BLOSC_HEADER_BYTES, np.uint8)
         self._frames, self._offset = 0, 0
@@ -226,6 +228,23 @@ class ShardWriter:
                 parts[0] = parts[0][written:]
 
 
+def read_index(handle: int, tiles: tuple[int, ...]) -> NDArray[np.uint64]:
+    """Return the index at the end of an open shard file: offset and length of each tile, (..., 2).
+
+    Raises
+    ------
+    ValueError
+        Where it is damaged.
+    """
+    index_bytes = 16 * math.prod(tiles) + CHECKSUM_BYTES
+    tail = os.pread(handle, index_bytes, max(0, os.fstat(handle).st_size - index_bytes))
+    try:
+        index: NDArray[np.uint64] = np.frombuffer(unchecked(memoryview(tail)), "<u8").reshape(*tiles, 2)
+    except ValueError as error:
+        raise ValueError("the index at the end is damaged") from error
+    return index
+
+
 class ShardReader:
     """Reads tiles of one shard, and checks each.
 
@@ -250,16 +269,13 @@ class ShardReader:
 
     def __enter__(self) -> ShardReader:
         self._file = self._path.open("rb", buffering=0)
-        index_bytes = 16 * math.prod(self._grid.tiles) + CHECKSUM_BYTES
-        tail = os.pread(self._file.fileno(), index_bytes, max(0, os.fstat(self._file.fileno()).st_size - index_bytes))
         try:
-            index = np.frombuffer(unchecked(memoryview(tail)), "<u8")
-            self._index = index.reshape(*self._grid.tiles, 2)
-        except ValueError as error:
+            self._index = read_index(self._file.fileno(), self._grid.tiles)
+        except (OSError, ValueError):
             self._file.close()
-            raise ValueError("the index at the end is damaged") from error
+            raise
         lengths = self._index[..., 1]
-        self._stored = memoryview(bytearray(int(lengths.max(where=lengths != _ABSENT, initial=0))))
+        self._stored = memoryview(bytearray(int(lengths.max(where=lengths != ABSENT, initial=0))))
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -268,7 +284,7 @@ class ShardReader:
     def read_tile(self, layer: int, row: int, column: int, out: Pixels) -> None:
         """Decode a tile into ``out``, contiguous and as large as a tile."""
         offset, length = self._index[layer, row, column].tolist()
-        if offset == _ABSENT:
+        if offset == ABSENT:
             raise ValueError(f"tile {layer, row, column} is missing")
         try:
             count = os.preadv(self._file.fileno(), [self._stored[:length]], offset)

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from . import disk
-from .damage import ATTRIBUTE, CHECKED, METADATA, damaged, read_json, reading
+from .damage import CHECKED, METADATA, damaged, read_json, reading
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
 from .shard_files import CHUNK_KEYS, crc32c
+
+ATTRIBUTE = "tract_dask"
+"""Name of the attribute under which every store keeps its provenance and its own metadata."""
 
 FORMAT = 2
 """Number of the format in which stores are written. In format 1 chunks had no checksums, and stores no number."""
@@ -90,7 +93,7 @@ def attributes(path: Path) -> dict[str, Any]:
         if any((path / name / METADATA).exists() for name in _MARKS):
             raise damaged(file, "no metadata of tract_dask" if metadata else "no such file")
         return {}
-    number, checksum = found.get("format", 1), found.pop("checksum", None)
+    number, checksum = format_of(found), found.pop("checksum", None)
     if (checksum is not None or number != 1) and checksum != _digest(metadata):
         raise damaged(file, "its checksum is that of other data: it was damaged, or changed by another program")
     if number > FORMAT:
@@ -103,6 +106,12 @@ def attributes(path: Path) -> dict[str, Any]:
             "Install that version or a newer one, or remove the store and make it anew",
         )
     return found
+
+
+def format_of(about: Mapping[str, Any]) -> int:
+    """Return the number of a store's format, by its attributes; 1 for stores that have none."""
+    number = about.get("format")
+    return number if isinstance(number, int) else 1  # in format 1 it was that of a movie's source
 
 
 def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **changes: Any) -> None:
@@ -145,6 +154,23 @@ def seal(path: Path) -> None:
     write_root(path, metadata)
 
 
+def nodes(store: Path) -> list[str]:
+    """Return the names of the arrays and groups that a store holds, or should."""
+    about = attributes(store)
+    return list(about["arrays"] if "arrays" in about else _nodes(store))
+
+
+def read_node(store: Path, name: str) -> dict[str, Any]:
+    """Return the metadata of an array or group of a store, checked.
+
+    Raises
+    ------
+    StoreError
+        Where they are damaged or missing.
+    """
+    return _read_node(store, attributes(store), name)
+
+
 def _nodes(path: Path, inside: str = "") -> Iterator[str]:
     """Yield the names of the arrays and groups inside a group, whatever their depth."""
     for folder in sorted((path / inside).iterdir()):
@@ -168,22 +194,26 @@ def _store_around(array: Path) -> tuple[Path, dict[str, Any]]:
     return array.parent, {}
 
 
-def _check_nodes(store: Path, about: Mapping[str, Any], names: Collection[str]) -> None:
+def _check_nodes(store: Path, about: Mapping[str, Any], names: Iterable[str]) -> None:
     """Check that the metadata of arrays are those that were written."""
-    known = about.get("arrays", {})
     for name in names:
-        if name in known:
-            file = store / name / METADATA
-            found = read_json(file)
-            if not found:
-                raise damaged(file, "no such file", "is missing")
-            if _digest(found) != known[name]:
-                raise damaged(file, "its checksum is that of other data")
+        if name in about.get("arrays", ()):
+            _read_node(store, about, name)
+
+
+def _read_node(store: Path, about: Mapping[str, Any], name: str) -> dict[str, Any]:
+    file, known = store / name / METADATA, about.get("arrays", {})
+    found = read_json(file)
+    if not found:
+        raise damaged(file, "no such file", "is missing")
+    if _digest(found) != known.get(name, _digest(found)):
+        raise damaged(file, "its checksum is that of other data")
+    return found
 
 
 def _is_whole(about: Mapping[str, Any]) -> bool:
     """Tell whether every chunk of a store has to be there."""
-    return about.get("format", 1) >= FORMAT and bool(about.get("complete", True))
+    return format_of(about) >= FORMAT and bool(about.get("complete", True))
 
 
 @contextmanager
@@ -280,7 +310,7 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
     """
     about = attributes(path)
     _check_nodes(path, about, about.get("arrays", ()))
-    whole = about.get("format", 1) >= FORMAT and not partial
+    whole = format_of(about) >= FORMAT and not partial
     try:
         with zarr.config.set(CHECKED if whole else {}), _opening(path):
             opened: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
