@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"journal", "provenance", "shards", "stores"}
+STORES = GROUND | {"journal", "keyed", "provenance", "shards", "stamps", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
@@ -20,7 +20,9 @@ ALLOWED = {
     "progress": set(),
     "schema": {"errors"},
     "settings": {"errors"},
-    "provenance": {"settings"},
+    "keyed": {"settings"},
+    "provenance": {"keyed", "settings"},
+    "stamps": {"errors"},
     "stores": {"errors", "schema"},
     "shards": set(),
     "journal": {"shards", "stores"},

@@ -304,7 +304,7 @@ def _in_movie(
 ) -> Places:
     template = b"" if detector.template is None else detector.template.tobytes()
     with Passes("detect", movie, on_event, folder, client, runs=1) as stage:
-        done = stage.journal("detections", stage_key(movie.key, repr(detector), template, repr(movie.shape)))
+        done = stage.journal("detections", stage_key("columns", movie.key, repr(detector), template, movie.shape))
         stage.begin([(done, movie.shards)])
         stage.run(partial(_detect_shard, movie, detector, done.path), movie.shards, done)
         found = np.concatenate([load_array(done.path / f"{shard.index}.npy") for shard in movie.shards])

@@ -22,6 +22,11 @@ class Hdf5Source(Source):
 
     inner: str
 
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside their file."""
+        return self.inner
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
         try:

@@ -19,12 +19,25 @@ class SequenceSource(Source):
     """Files read one after the other; ``firsts`` holds each file's first frame and, last, the number of frames."""
 
     firsts: tuple[int, ...]
+    inner: str
     open_file: Callable[[Path], Source]
 
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return len(self.files) == self.shape[0]
+
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside each file; empty where the files are the movie."""
+        return self.inner
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
+        if len(self.files) != len(self.firsts) - 1:  # some files are made of others
+            return slice(None)
+        first = int(np.searchsorted(self.firsts, start, side="right")) - 1
+        return slice(first, int(np.searchsorted(self.firsts, stop, side="left")))
 
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
@@ -72,6 +85,7 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
         dtype=parts[0].dtype,
         metadata=replace(metadata, notes=metadata.notes + gaps([file.name for file in files])),
         firsts=firsts,
+        inner=parts[0].inside,
         open_file=open_file,
     )
 

@@ -75,6 +75,13 @@ class FrameSource(Protocol):
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
 
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside their file; empty where the file is the movie."""
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
 
@@ -103,6 +110,15 @@ class Source:
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return False
+
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside their file; empty where the file is the movie."""
+        return ""
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included): all, where that is not known."""
+        return slice(None)
 
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
