@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
 from . import schema, stores
-from .errors import ChangedSourceError, DestinationError, SourceError
+from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError
 from .io import FrameSource, SourceMetadata, open_source
-from .io.source import Source, unreadable
+from .io.source import Source, reading
 from .journal import Journal, Payload, journal_beside
 from .kernels.binning import FrameMeter
 from .keyed import counted, default_of
@@ -169,11 +169,9 @@ def origin_of(source: FrameSource) -> Origin:
         Where a file cannot be read.
     """
     if source not in _origins:
-        try:
+        with reading(source.path):
             stamps = Stamps.of(source.files)  # first: a change meanwhile has to be noticed later
             _origins[source] = Origin(stamps, _content(source))
-        except OSError as error:
-            raise unreadable(source.path, error) from error
     return _origins[source]
 
 
@@ -291,17 +289,19 @@ class GoneSource(Source):
     content: str
 
 
-def remembered_source(path: Path, source: str) -> GoneSource | None:
+def remembered_source(path: Path, source: str, error: SourceError) -> GoneSource | None:
     """Return the source of the complete movie at ``path``, which is not there; None where it is, or is another.
 
     Parameters
     ----------
     source
         Where it should be. It has the name that it had, in any folder.
+    error
+        Why it cannot be opened.
     """
     present = stores.attributes(path)
     known = present.get("complete") and present.get("made") and _name(present["source"]) == _name(source)
-    if not known or _is_there(source):
+    if not known or not (isinstance(error, MissingSourceError) or _is_out_of_reach(source)):
         return None
     note = f"{source} is not there: the run goes on with the movie that was converted from it"
     return GoneSource(
@@ -321,15 +321,15 @@ def _name(source: str) -> tuple[str, str]:
     return Path(outer).name, inner
 
 
-def _is_there(source: str) -> bool:
-    """Tell whether there is any file, or a folder that is not empty, at a source's path."""
-    outer = Path(source.partition("::")[0])
+def _is_out_of_reach(source: str) -> bool:
+    """Tell whether the system does not even say what is at a source's path, as where a mount has gone."""
     try:
-        if outer.is_dir():
-            return any(outer.iterdir())
-        return outer.exists() or any(outer.parent.glob(outer.name))
-    except OSError:  # such as a mount that has gone
-        return False
+        Path(source.partition("::")[0]).stat()
+    except FileNotFoundError:
+        return False  # a pattern, or the reader knows better
+    except OSError:
+        return True
+    return False
 
 
 def _remembered(source: FrameSource) -> dict[str, Any]:

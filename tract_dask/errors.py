@@ -56,6 +56,10 @@ class SourceError(InputError):
     """A movie file is missing, damaged, or not a movie."""
 
 
+class MissingSourceError(SourceError):
+    """A movie file is not there, or one that it leads to."""
+
+
 class ChangedSourceError(SourceError):
     """A movie's files changed while they were read."""
 

@@ -513,8 +513,8 @@ def _open(source: str | Path, settings: RunSettings, kept: Path | None) -> Frame
     path = str(Path(source).absolute())
     try:
         return open_source(path, settings.source)
-    except SourceError:
-        gone = None if kept is None else remembered_source(kept, path)
+    except SourceError as error:
+        gone = None if kept is None else remembered_source(kept, path, error)
         if gone is None:
             raise
         return gone

@@ -42,7 +42,8 @@ def fingerprint(*paths: Path) -> str:
     """Return a fingerprint of what files hold, whatever their names, folders and times.
 
     Small movies are read whole. Of others, whose hash would cost as much as their conversion, these are read: the first
-    and the last megabyte, 64 blocks of 64 KiB spread over all, and a block from the middle of each file.
+    and the last megabyte of the first and the last file, 64 blocks of 64 KiB spread over all, and a block from the
+    middle of each file.
     """
     sizes = [path.stat().st_size for path in paths]
     digest = hashlib.sha256(json.dumps(sizes).encode())
@@ -60,7 +61,8 @@ def _samples(sizes: list[int]) -> Iterator[tuple[int, int, int]]:
         yield from ((number, 0, size) for number, size in enumerate(sizes))
         return
     starts = [0, *accumulate(sizes)]
-    blocks = [(0, 0, _END_BYTES), (len(sizes) - 1, max(0, sizes[-1] - _END_BYTES), _END_BYTES)]
+    blocks = [(number, 0, _END_BYTES) for number in (0, len(sizes) - 1)]
+    blocks += [(number, max(0, sizes[number] - _END_BYTES), _END_BYTES) for number in (0, len(sizes) - 1)]
     for k in range(_SAMPLES):  # one in each part of the whole, not at the same place of each: frames are alike there
         place = int((k + k * _GOLDEN % 1) / _SAMPLES * starts[-1])
         number = int(np.searchsorted(starts, place, side="right")) - 1
