@@ -22,13 +22,12 @@ import numpy as np
 import zarr
 from distributed import Client
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
 
-from . import schema, stores
+from . import disk, schema, stores
 from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError
 from .io import FrameSource, SourceMetadata, open_source
 from .io.source import Source, reading
-from .journal import Journal, Payload, journal_beside
+from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .keyed import counted, default_of
 from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
@@ -36,7 +35,7 @@ from .ome import AXES, describe
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import ALGORITHMS, WHOLE_BYTES, digest_of, fingerprint, provenance, stage_key
 from .settings import ConvertSettings, MetadataSettings, SourceSettings
-from .shard_files import BLOSC, Grid, ShardWriter, shard_path
+from .shard_files import CHUNK_KEYS, Grid, ShardWriter, chunk_path, codecs
 from .shards import Shard, split
 from .stamps import Stamps, changed
 from .tasks import stream_shards
@@ -101,7 +100,7 @@ def convert(
 
     if is_converted(path, movie, settings, source_settings):
         update_metadata(path, known, **_remembered(movie))
-        stores.remove(journal_beside(path))
+        remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
         on_event(StageDone(STAGE, time.perf_counter() - started, reused=True, summary="already converted"))
         return path
@@ -116,7 +115,7 @@ def convert(
             _clear(path)
             about = provenance(key, settings) | _made(origin, settings, source_settings) | _remembered(movie)
             _create(path, layout, settings.codec, about, known)
-        journal = Journal(journal_beside(path), key)
+        journal = Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
     on_event(announce(done_frames=journal.frames_done(shards)))
     statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
 
@@ -124,7 +123,7 @@ def convert(
         for name, values in statistics.items():
             values[shard.start : shard.stop] = payload[name]
 
-    job = _Job(_absolute(movie.path), source_settings, path, layout, settings.codec, origin.stamps)
+    job = _Job(_absolute(movie.path), source_settings, path, journal.path, layout, settings.codec, origin.stamps)
     with _unchanged(path, movie, origin):
         stream_shards(
             partial(_convert_shard, job),
@@ -134,6 +133,8 @@ def convert(
             name=STAGE,
             client=client,
             on_done=lambda shard, payload: on_event(ShardDone(STAGE, shard.index, shard.frames)),
+            file=movie.path,
+            on_event=on_event,
         )
     _finalise(path, statistics, known)
     journal.remove()
@@ -307,7 +308,7 @@ def remembered_source(path: Path, source: str, error: SourceError) -> GoneSource
     return GoneSource(
         path=source,
         files=(),
-        format=present["format"],
+        format=present["source_format"],
         shape=tuple(present["shape"]),
         dtype=np.dtype(present["dtype"]),
         metadata=SourceMetadata(**present["file_says"], notes=(note,)),
@@ -336,7 +337,7 @@ def _remembered(source: FrameSource) -> dict[str, Any]:
     """Return what a movie remembers of a source that is there."""
     if isinstance(source, GoneSource):
         return {}
-    return {"source": _absolute(source.path), "format": source.format, "file_says": _quantities(source.metadata)}
+    return {"source": _absolute(source.path), "source_format": source.format, "file_says": _quantities(source.metadata)}
 
 
 def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
@@ -361,7 +362,8 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
     Where only samples of the source are compared, its files have to be as old as they were.
     """
     present = stores.attributes(path)
-    if present.get("kind") != "movie" or present.get("key") != key or present.get("complete"):
+    ours = present.get("format") == stores.FORMAT  # shards of an older format do not go with ours
+    if present.get("kind") != "movie" or present.get("key") != key or present.get("complete") or not ours:
         return False
     if stamps.total_bytes > WHOLE_BYTES and present.get("written") != stamps.written:
         on_event(Warned("the movie was written again since its conversion was interrupted, which begins anew"))
@@ -402,6 +404,7 @@ class _Job:
     source: str
     source_settings: SourceSettings
     path: Path
+    aside: Path
     layout: Layout
     codec: str
     stamps: Stamps
@@ -466,7 +469,8 @@ def _writer(job: _Job, factor: int, index: int) -> ShardWriter:
     """Return the writer of a shard of the frames (``factor`` 1) or of a binned level."""
     array = job.path / ("0" if factor == 1 else f"binned/{factor}")
     dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
-    return ShardWriter(shard_path(array, index), journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
+    place = chunk_path(array, index, 0, 0)
+    return ShardWriter(place, job.aside, job.layout.grid(factor), dtype, job.codec)
 
 
 def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
@@ -492,7 +496,7 @@ def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known
         "bins": layout.bins,
     }
     describe(aside, about | plan | _quantities(known))
-    aside.replace(path)
+    disk.place_folder(aside, path)
 
 
 def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> zarr.Array[Any]:
@@ -502,7 +506,8 @@ def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> z
         chunks=grid.chunk,
         shards=grid.shard,
         dtype=dtype,
-        compressors=BloscCodec(**BLOSC[codec]) if codec in BLOSC else None,
+        compressors=codecs(codec),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
         dimension_names=AXES,
         zarr_format=3,
@@ -515,6 +520,8 @@ def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: d
         shape=(length,),
         chunks=(length,),
         dtype=dtype,
+        compressors=codecs("zstd"),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
         dimension_names=(axis,),
         attributes=attributes,
@@ -526,7 +533,8 @@ def _finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sou
     """Write the statistics (frames,) and the metadata, and say that the store is complete."""
     with stores.disk_errors(path):
         for name, values in statistics.items():
-            zarr.open_array(str(path / name), mode="r+")[...] = values
+            stores.overwrite_array(path / name, values)
+        disk.sync_folders(path, tuple(statistics))
         describe(path, stores.attributes(path) | _quantities(known) | {"complete": True})
 
 
@@ -561,7 +569,7 @@ def _is_zarr(folder: Path) -> bool:
 
 def _clear(path: Path) -> None:
     """Remove a store and its journal; renamed first, so that what is at ``path`` is always whole."""
-    stores.remove(journal_beside(path))
+    remove_journal(journal_beside(path))
     aside = path.with_name(f".{path.name}.removed")
     stores.remove(aside)
     if path.exists():

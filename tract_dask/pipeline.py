@@ -23,7 +23,7 @@ from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError, SourceError
 from .fit import FitSummary
 from .io import FrameSource, open_source
-from .journal import journal_beside
+from .journal import journal_beside, remove_journal
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
 from .progress import (
@@ -630,8 +630,8 @@ def clear_run(outputs: Outputs, on_event: Sink = silent, *, keep_edited: bool = 
     clear_columns(outputs.columns, on_event, keep_edited=keep_edited)
     stages = (outputs.movie, outputs.drift, outputs.sum, outputs.results)
     for path in stages:
+        remove_journal(journal_beside(path))
         stores.remove(path)
-        stores.remove(journal_beside(path))
     for path in (outputs.report, outputs.settings, outputs.events):
         stores.remove(path)
 
