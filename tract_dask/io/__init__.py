@@ -21,7 +21,7 @@ from .hdf5 import open_hdf5
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
-from .sequence import natural_key, open_sequence
+from .sequence import SequenceSource, natural_key, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
 
@@ -88,10 +88,13 @@ def open_source(
     SettingsError
         Where a raw file is not, or wrongly, declared.
     """
-    several = not isinstance(path, str | Path)
-    name = str(next(iter(path), "")) if several else str(path)
+    names = [str(path)] if isinstance(path, str | Path) else [str(file) for file in path]
+    name = names[0] if names else "an empty list"
     with reading(name):
-        source = _open_list(list(map(str, path)), settings, permit) if several else _open(name, settings, permit)
+        if isinstance(path, str | Path):
+            source: Source = _open(name, settings, permit)
+        else:
+            source = _open_list(names, settings, permit)
     known = source.metadata
     merged = SourceMetadata(
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
@@ -144,7 +147,7 @@ def _open(name: str, settings: SourceSettings, permit: Permit | None) -> Source:
     return open_file(place)
 
 
-def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> Source:
+def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> SequenceSource:
     """Open files as one movie in the order of the list; all have the same path inside."""
     split = [_split(name) for name in names]
     inside = {inner for _, inner in split}
@@ -153,7 +156,7 @@ def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None
             "the files of a list have different paths inside", names[0], "one path", ", ".join(sorted(inside)[:9])
         )
     open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
-    return open_sequence(names[0] if names else "an empty list", [Path(outer) for outer, _ in split], open_file)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
 
 
 def _split(name: str) -> tuple[str, str]:

@@ -298,19 +298,20 @@ def reading(
     except TractError:
         raise
     except OSError as error:
-        raise unreadable(where, error, what) from _plain(error)
+        raise unreadable(where, _plain(error), what, remedy) from _plain(error)
     except MemoryError as error:
         raise TractError(
             "memory ran out while the movie was read",
             where,
-            got=_words(error),
+            got=words(error),
             remedy="Give each worker more memory, for example by fewer workers",
         ) from error
     except Exception as error:
-        raise SourceError(what, where, got=_words(error), remedy=remedy) from error
+        raise SourceError(what, where, got=words(error), remedy=remedy) from error
 
 
-def _words(error: BaseException) -> str:
+def words(error: BaseException) -> str:
+    """Return what an error says, in one line that is not too long; its name where it says nothing."""
     text = " ".join(str(error).split())
     return text[:300] or type(error).__name__
 
@@ -321,17 +322,18 @@ def _plain(error: OSError) -> OSError:
     return OSError(int(found[1]), os.strerror(int(found[1]))) if found and int(found[1]) else error
 
 
-def unreadable(where: str, error: OSError, what: str = "the file cannot be read") -> SourceError:
-    """Return the error for what the system, or a library on its behalf, says of a file."""
+def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceError:
+    """Return the error for what the system says of a file, or, with ``remedy``, what a library says of its content."""
     if "unable to lock file" in str(error):
         return SourceError(
             "another program has locked the file",
             where,
-            got=_words(error),
+            got=words(error),
             remedy="Wait until it has been written, or close it there",
         )
-    reason = error.strerror or _words(error)
-    return SourceError(what, where, got=reason, remedy="Check that it is there, its permissions, and its disk")
+    if error.errno is not None:
+        remedy = "Check that it is there, its permissions, and its disk"
+    return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
 def truncated(where: str, place: str, expected: int, got: int) -> SourceError:
