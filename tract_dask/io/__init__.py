@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -144,6 +145,7 @@ def _open(name: str, settings: SourceSettings, permit: Permit | None) -> Source:
         return open_sequence(name, _by_number(_readable(place)), open_file)
     if _is_pattern(place):
         return open_sequence(name, _by_number(_matching(place)), open_file)
+    _check_folder(place)
     return open_file(place)
 
 
@@ -161,27 +163,29 @@ def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None
 
 def _split(name: str) -> tuple[str, str]:
     """Return the path of a file, and the path inside it after two colons; a file whose name has colons is that file."""
-    places = [match.start() for match in re.finditer("::", name)]
-    for place in (len(name), *reversed(places)):
-        if os.path.lexists(name[:place]):
-            return name[:place], name[place + 2 :]
-    return name.partition("::")[0], name.partition("::")[2]
+    ends = [match.start() for match in re.finditer("::", name)]
+    there = [end for end in (len(name), *reversed(ends)) if os.path.lexists(name[:end])]
+    files = (end for end in there if not name[:end].endswith("/"))
+    fitting = (end for end in (*ends, len(name)) if _is_pattern(Path(name[:end])))
+    end = next(chain(files, fitting, there), ends[0] if ends else len(name))
+    return name[:end], name[end + 2 :]
 
 
 def _is_pattern(place: Path) -> bool:
-    """Tell whether a path that is not there is a pattern, which only its last part may be."""
-    if not any(sign in str(place) for sign in _WILD) or os.path.lexists(place):
-        return False
-    folder = place.parent
-    if not folder.is_dir() and any(sign in str(folder) for sign in _WILD):
+    """Tell whether a path that is not there is a pattern for the files of a folder that is."""
+    return any(sign in place.name for sign in _WILD) and not os.path.lexists(place) and place.parent.is_dir()
+
+
+def _check_folder(place: Path) -> None:
+    """Refuse a pattern for folders: only the last part of a path may be one."""
+    if any(sign in str(place.parent) for sign in _WILD) and not os.path.lexists(place.parent):
         raise SourceError(
             "there is no such folder",
-            str(folder),
+            str(place.parent),
             "a folder, and a pattern for the names in it only",
             str(place),
             "Name the folder without * ? or [",
         )
-    return folder.is_dir()
 
 
 def _matching(pattern: Path) -> list[Path]:

@@ -132,6 +132,7 @@ class Source:
                 " x ".join(map(str, frames.shape)),
                 "Wait until it has been written, then begin again",
             )
+        self._check_exact(start, frames)
         return frames
 
     def read_into(self, start: int, frames: Frames) -> None:
@@ -143,6 +144,20 @@ class Source:
             For whatever is wrong with the file.
         """
         frames[...] = self.read(start, start + len(frames))
+
+    def _check_exact(self, start: int, frames: Frames) -> None:
+        """Refuse whole numbers that sums and fits, which are done in float64, would round without a word."""
+        if self.dtype.kind not in "iu" or self.dtype.itemsize < 8 or not frames.size:
+            return
+        low, high = int(frames.min()), int(frames.max())
+        if max(-low, high) > _EXACT:
+            raise SourceError(
+                f"frames {start} to {start + len(frames) - 1} hold whole numbers that float64 cannot tell apart",
+                self.path,
+                f"values from -{_EXACT:,} to {_EXACT:,}",
+                f"values from {low:,} to {high:,}",
+                "Subtract an offset or divide by a factor, and save the movie as float64 or uint32",
+            )
 
     def _read(self, start: int, stop: int) -> Frames:
         """Return frames as :meth:`read` does; what libraries raise becomes a SourceError there."""
@@ -218,6 +233,9 @@ FRAME_BYTES, RATIO = 64 << 20, 1000
 """A frame may claim so many bytes, and so many times the bytes of its file, before it is believed to be damaged."""
 
 MOST_FRAMES = 2**31 - 1
+"""More are a damaged header."""
+
+_EXACT = 2**53
 
 
 def checked_claim(n_bytes: int, size: int, where: str, what: str = "one frame") -> None:
