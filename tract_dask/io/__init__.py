@@ -155,7 +155,11 @@ def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None
     inside = {inner for _, inner in split}
     if len(inside) > 1:
         raise SourceError(
-            "the files of a list have different paths inside", names[0], "one path", ", ".join(sorted(inside)[:9])
+            "the files of a list have different paths inside",
+            names[0],
+            "one path",
+            ", ".join(repr(path) for path in sorted(inside)[:9]),
+            "Name the same data set in each of them",
         )
     open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
     return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)

@@ -340,15 +340,22 @@ def _plain(error: OSError) -> OSError:
     return OSError(int(found[1]), os.strerror(int(found[1]))) if found and int(found[1]) else error
 
 
+_BUSY = (
+    ("unable to lock file", "another program has locked the file", "Wait until it is written, or close it there"),
+    (
+        "already open for write",
+        "another program is writing the file, or ended before it had written it",
+        "Wait until it is written; if nothing writes it any more, run h5clear -s on a copy",
+    ),
+)
+"""What HDF5 says of a file that is being written, and what we say."""
+
+
 def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceError:
     """Return the error for what the system says of a file, or, with ``remedy``, what a library says of its content."""
-    if "unable to lock file" in str(error):
-        return SourceError(
-            "another program has locked the file",
-            where,
-            got=words(error),
-            remedy="Wait until it has been written, or close it there",
-        )
+    for sign, said, advice in _BUSY:
+        if sign in str(error):
+            return SourceError(said, where, got=words(error), remedy=advice)
     if error.errno is not None:
         remedy = "Check that it is there, its permissions, and its disk"
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
