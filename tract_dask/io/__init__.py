@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,7 +22,7 @@ from .hdf5 import open_hdf5
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
-from .sequence import natural_key, open_sequence
+from .sequence import SequenceSource, natural_key, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
 
@@ -88,10 +89,13 @@ def open_source(
     SettingsError
         Where a raw file is not, or wrongly, declared.
     """
-    several = not isinstance(path, str | Path)
-    name = str(next(iter(path), "")) if several else str(path)
+    names = [str(path)] if isinstance(path, str | Path) else [str(file) for file in path]
+    name = names[0] if names else "an empty list"
     with reading(name):
-        source = _open_list(list(map(str, path)), settings, permit) if several else _open(name, settings, permit)
+        if isinstance(path, str | Path):
+            source: Source = _open(name, settings, permit)
+        else:
+            source = _open_list(names, settings, permit)
     known = source.metadata
     merged = SourceMetadata(
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
@@ -141,44 +145,51 @@ def _open(name: str, settings: SourceSettings, permit: Permit | None) -> Source:
         return open_sequence(name, _by_number(_readable(place)), open_file)
     if _is_pattern(place):
         return open_sequence(name, _by_number(_matching(place)), open_file)
+    _check_folder(place)
     return open_file(place)
 
 
-def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> Source:
+def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> SequenceSource:
     """Open files as one movie in the order of the list; all have the same path inside."""
     split = [_split(name) for name in names]
     inside = {inner for _, inner in split}
     if len(inside) > 1:
         raise SourceError(
-            "the files of a list have different paths inside", names[0], "one path", ", ".join(sorted(inside)[:9])
+            "the files of a list have different paths inside",
+            names[0],
+            "one path",
+            ", ".join(repr(path) for path in sorted(inside)[:9]),
+            "Name the same data set in each of them",
         )
     open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
-    return open_sequence(names[0] if names else "an empty list", [Path(outer) for outer, _ in split], open_file)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
 
 
 def _split(name: str) -> tuple[str, str]:
     """Return the path of a file, and the path inside it after two colons; a file whose name has colons is that file."""
-    places = [match.start() for match in re.finditer("::", name)]
-    for place in (len(name), *reversed(places)):
-        if os.path.lexists(name[:place]):
-            return name[:place], name[place + 2 :]
-    return name.partition("::")[0], name.partition("::")[2]
+    ends = [match.start() for match in re.finditer("::", name)]
+    there = [end for end in (len(name), *reversed(ends)) if os.path.lexists(name[:end])]
+    files = (end for end in there if not name[:end].endswith("/"))
+    fitting = (end for end in (*ends, len(name)) if _is_pattern(Path(name[:end])))
+    end = next(chain(files, fitting, there), ends[0] if ends else len(name))
+    return name[:end], name[end + 2 :]
 
 
 def _is_pattern(place: Path) -> bool:
-    """Tell whether a path that is not there is a pattern, which only its last part may be."""
-    if not any(sign in str(place) for sign in _WILD) or os.path.lexists(place):
-        return False
-    folder = place.parent
-    if not folder.is_dir() and any(sign in str(folder) for sign in _WILD):
+    """Tell whether a path that is not there is a pattern for the files of a folder that is."""
+    return any(sign in place.name for sign in _WILD) and not os.path.lexists(place) and place.parent.is_dir()
+
+
+def _check_folder(place: Path) -> None:
+    """Refuse a pattern for folders: only the last part of a path may be one."""
+    if any(sign in str(place.parent) for sign in _WILD) and not os.path.lexists(place.parent):
         raise SourceError(
             "there is no such folder",
-            str(folder),
+            str(place.parent),
             "a folder, and a pattern for the names in it only",
             str(place),
             "Name the folder without * ? or [",
         )
-    return folder.is_dir()
 
 
 def _matching(pattern: Path) -> list[Path]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +13,7 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings import SourceSettings
-from ..stores import load_array, sole_parser
+from ..stores import sole_parser
 from .blocks import open_block
 from .source import Frames, Source, SourceMetadata, checked_dtype, checked_shape, truncated, widened
 
@@ -21,15 +23,26 @@ _HEADER_BYTES = 10_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FortranSource(Source):
-    """A .npy file with the frame axis fastest (Fortran order), read through a memory map; ``n_bytes`` long."""
+    """A .npy file with the frame axis fastest (Fortran order), read through a memory map.
 
+    Attributes
+    ----------
+    axes, stored
+        Shape (two axes where it is one image) and type of the array in the file.
+    offset, n_bytes
+        Where its pixels begin, and the size of the file that holds them all.
+    """
+
+    axes: tuple[int, ...]
+    stored: np.dtype[Any]
+    offset: int
     n_bytes: int
 
     def _read(self, start: int, stop: int) -> Frames:
         size = self.files[0].stat().st_size
         if size < self.n_bytes:  # to touch a map beyond its file would end the process
             raise truncated(self.path, "before the frames that it held when it was opened", self.n_bytes, size)
-        frames = load_array(self.files[0], mmap_mode="r").reshape(self.shape)[start:stop]
+        frames = np.memmap(self.files[0], self.stored, "r", self.offset, self.axes, "F").reshape(self.shape)[start:stop]
         return widened(np.array(frames, order="C"), self.dtype)
 
 
@@ -60,7 +73,10 @@ def open_npy(path: Path, inner: str, settings: SourceSettings) -> Source:
         shape=checked_shape(shape, str(path)),
         dtype=checked_dtype(stored, str(path)),
         metadata=SourceMetadata(),
-        n_bytes=offset + int(np.prod(shape, dtype=object)) * stored.itemsize,
+        axes=tuple(shape),
+        stored=stored,
+        offset=offset,
+        n_bytes=offset + math.prod(shape) * stored.itemsize,
     )
 
 
@@ -68,12 +84,21 @@ def _header(path: Path) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Return shape, whether the order is Fortran's, pixel type, and where the pixels begin."""
     with path.open("rb") as file:
         first = np.lib.format.read_magic(file) == (1, 0)
-        start = file.tell()
         length = struct.unpack("<H" if first else "<I", file.read(2 if first else 4))[0]
         if length > _HEADER_BYTES:
             raise ValueError(f"a header of {length:,} bytes")
-        file.seek(start)
+        text = file.read(length)
+        if found := _USUAL.fullmatch(text):
+            shape = tuple(int(part) for part in found[3].split(b",") if part.strip())
+            return shape, found[2] == b"True", np.dtype(found[1].decode()), file.tell()
+        file.seek(8)
         with sole_parser():
             read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
             shape, fortran, stored = read(file)
         return shape, fortran, stored, file.tell()
+
+
+_USUAL = re.compile(
+    rb"\{'descr': '([<>|=]?[a-z]\d+)', 'fortran_order': (True|False), 'shape': \(([\d, ]*)\),? *\} *\n?"
+)
+"""A header as NumPy writes it, which is read without Python's parser and the lock that it takes."""
