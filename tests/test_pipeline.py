@@ -125,7 +125,6 @@ def test_second_run_does_nothing_and_starts_no_cluster(done, scene, monkeypatch)
         ({"columns": {"search_radius_px": 0.0}}, {"columns"}),
         ({"drift": {"method": "none"}}, {"drift", "sum", "columns", "fit"}),
         ({"metadata": {"gain": 2.0}}, {"sum", "columns", "fit"}),
-        ({"convert": {"codec": "zstd"}}, {"convert", "drift", "sum", "fit"}),
         ({"cluster": {"workers": 1}}, set()),
     ],
 )
@@ -156,17 +155,6 @@ def test_edited_columns_are_kept_and_fitted_anew(done, scene):
     assert file.read_text() == edited
     assert done().reused == STAGES
     assert done.of(Warned) == []
-
-
-def test_edited_columns_are_put_away_where_new_settings_replace_them(done):
-    file = done.output / "columns.csv"
-    lines = file.read_text().splitlines()
-    edited = "\n".join([lines[0], *lines[2:]]) + "\n"
-    file.write_text(edited)
-    done()
-    done(change(columns={"min_amplitude": 0.2}))
-    assert len(table(file)) == len(lines) - 1
-    assert file.with_stem("columns-edited").read_text() == edited
 
 
 def test_interrupted_and_failed_runs_go_on_to_the_same_result(base, done, monkeypatch):

@@ -303,9 +303,8 @@ def _in_movie(
 ) -> Places:
     template = b"" if detector.template is None else detector.template.tobytes()
     with Passes("detect", movie, on_event, folder, client, runs=1) as stage:
-        done = stage.journal(
-            "detections", stage_key(movie.key, repr(detector), template, repr(movie.shape)), {"found": ()}
-        )
+        key = stage_key("columns", movie.key, repr(detector), template, movie.shape)
+        done = stage.journal("detections", key, {"found": ()})
         stage.begin([(done, movie.shards)])
         stage.run(partial(_detect_shard, movie, detector, done.path), movie.shards, done)
         found = np.concatenate([load_saved(done.path / f"{shard.index}.npy") for shard in movie.shards])

@@ -41,6 +41,7 @@ from .kernels.registration import (
     search,
 )
 from .kernels.sums import Whole, add_shifted
+from .keyed import counted
 from .movie import Movie
 from .passes import Passes, load_saved, save_array
 from .progress import Sink, StageDone, StageStarted, Warned, silent
@@ -262,7 +263,7 @@ def _measure_drift(
     level = _choose_level(movie, settings)
     shards = _parts(movie)
     with Passes("drift", movie, on_event, folder, client, len(PASSES)) as stage:
-        key = stage_key(movie.key, f"drift {settings.search_px!r}")
+        key = stage_key("drift", movie.key, counted("drift", drift=settings))
         follow, refine = (stage.journal(name, f"{name} {key}", fields) for name, fields in PASSES.items())
         stage.begin([(follow, shards), (refine, shards)])
         payloads = stage.run(partial(_follow_shard, movie, level, follow.path), shards, follow)

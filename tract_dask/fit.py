@@ -17,6 +17,7 @@ from . import results, schema, stores
 from .errors import SettingsError, StoreError
 from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.gaussian import blurred
+from .keyed import counted
 from .measure import Floats, Job, measure
 from .movie import Movie
 from .parts import DamagedPartError, join, write
@@ -248,10 +249,11 @@ def _check_counts(smallest: Floats) -> None:
 
 def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
     """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
-    numbers = np.concatenate([job.reference.ravel(), job.drift.ravel(), columns["column_id"].to_numpy().astype(float)])
-    kinds = "\0".join(map(str, columns["kind"].to_numpy()))
-    rest = f"{movie.gain!r} {job.window} {job.vacuum} {job.refine_columns} {kinds}"
-    return stage_key(movie.key, numbers.tobytes(), rest, job.settings)
+    arrays = (job.reference, job.drift, columns["column_id"].to_numpy().astype(np.int64))
+    vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
+    numbers = [movie.gain, int(job.window), vacuum, job.refine_columns]
+    kinds = [str(kind) for kind in columns["kind"].to_numpy()]
+    return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
 
 
 def _spacing(columns: xr.Dataset) -> float:

@@ -66,7 +66,7 @@ def sum_image(
     per_part = -(-len(movie.shards) // SUM_PARTS)
     parts = split(movie.n_frames, max(1, movie.shards[0].frames) * per_part)
     with Passes("sum", movie, on_event, journal, client, runs=1) as stage:
-        done = stage.journal("parts", stage_key(movie.key, shift.tobytes(), used.tobytes()), {"missing": ()})
+        done = stage.journal("parts", stage_key("sum", movie.key, shift, used), {"missing": ()})
         stage.begin([(done, parts)])
         payloads = stage.run(partial(_sum_part, movie, shift, used, done.path), parts, done)
         exposure = coverage(movie.shape[1:], shift[used])

@@ -5,10 +5,14 @@ A format is a function from a path to a :class:`~tract_dask.io.source.Source` an
 
 from __future__ import annotations
 
+import fnmatch
+import os
+import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,11 +22,11 @@ from .hdf5 import open_hdf5
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
-from .sequence import open_sequence
-from .source import FrameSource, Source, SourceMetadata, unreadable
+from .sequence import SequenceSource, natural_key, open_sequence
+from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
 
-__all__ = ["READERS", "FrameSource", "SourceMetadata", "open_cached", "open_source"]
+__all__ = ["READERS", "FrameSource", "Permit", "SourceMetadata", "open_cached", "open_source"]
 
 Opener: TypeAlias = Callable[[Path, str, SourceSettings], Source]
 """Takes a file, the path inside it (HDF5 only), and how to read it; makes every check."""
@@ -50,22 +54,28 @@ _VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "T
 
 
 def open_source(
-    path: str | Path,
+    path: Path | str | Sequence[Path | str],
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
 ) -> FrameSource:
-    """Open a movie: a file, ``file.h5::/path/in/file``, a folder, or a glob of files that count up.
+    """Open a movie: a file, ``file.h5::/path/in/file``, a folder, a pattern for the files of one folder, or a list.
 
     Everything that can be wrong with it is found here, before any work.
 
     Parameters
     ----------
     path
-        What to open. In a folder, all files of its one readable format.
+        What to open. In a folder, all files of its one readable format; of several files, the frames in their order.
+        A path that is there is never taken for a pattern.
     settings
         Shape and type of raw files.
     metadata
         What the user knows better than the file.
+    permit
+        Called with the resolved path of every file before it is opened, also of those that links inside of HDF5 files
+        lead to; raises to refuse it. It is asked again where the files of a sequence are opened to be read.
 
     Returns
     -------
@@ -79,11 +89,13 @@ def open_source(
     SettingsError
         Where a raw file is not, or wrongly, declared.
     """
-    name = str(path)
-    try:
-        source = _open(name, settings)
-    except OSError as error:
-        raise unreadable(name, error) from error
+    names = [str(path)] if isinstance(path, str | Path) else [str(file) for file in path]
+    name = names[0] if names else "an empty list"
+    with reading(name):
+        if isinstance(path, str | Path):
+            source: Source = _open(name, settings, permit)
+        else:
+            source = _open_list(names, settings, permit)
     known = source.metadata
     merged = SourceMetadata(
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
@@ -96,44 +108,99 @@ def open_source(
 
 
 def open_cached(
-    path: str | Path,
+    path: str | Path | tuple[str | Path, ...],
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
 ) -> FrameSource:
     """Open a movie as :func:`open_source` does, or return it as this process last opened it, unless it has changed.
 
     For tasks, each of which opens the movie anew: to walk along 10,000 pages takes a while, to ask for a file's time
     does not.
     """
-    place = Path(str(path).partition("::")[0])
-    status = (place if place.exists() else place.parent).stat() if place.parent.exists() else None
+    first = path[0] if isinstance(path, tuple) and path else path
+    place = Path(_split(str(first))[0])
+    status = next((at.stat() for at in (place, place.parent) if at.exists()), None)
     stamp = (status.st_size, status.st_mtime_ns) if status else None
-    return _open_stamped(str(path), settings, metadata, stamp)
+    return _open_stamped(path if isinstance(path, tuple) else str(path), settings, metadata, permit, stamp)
 
 
 @lru_cache(maxsize=4)
 def _open_stamped(
-    path: str, settings: SourceSettings, metadata: MetadataSettings, stamp: tuple[int, int] | None
+    path: str | tuple[str | Path, ...],
+    settings: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    stamp: tuple[int, int] | None,
 ) -> FrameSource:
-    return open_source(path, settings, metadata)
+    return open_source(path, settings, metadata, permit=permit)
 
 
-def _open(name: str, settings: SourceSettings) -> Source:
-    outer, _, inner = name.partition("::")
+def _open(name: str, settings: SourceSettings, permit: Permit | None) -> Source:
+    outer, inner = _split(name)
     place = Path(outer)
-    open_file = partial(_open_file, inner=inner, settings=settings)
+    open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
     if place.is_dir():
-        return open_sequence(name, _readable(place), open_file)
-    if not place.exists() and any(sign in outer for sign in _WILD):
-        return open_sequence(name, _matching(place), open_file)
+        return open_sequence(name, _by_number(_readable(place)), open_file)
+    if _is_pattern(place):
+        return open_sequence(name, _by_number(_matching(place)), open_file)
+    _check_folder(place)
     return open_file(place)
 
 
+def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> SequenceSource:
+    """Open files as one movie in the order of the list; all have the same path inside."""
+    split = [_split(name) for name in names]
+    inside = {inner for _, inner in split}
+    if len(inside) > 1:
+        raise SourceError(
+            "the files of a list have different paths inside",
+            names[0],
+            "one path",
+            ", ".join(repr(path) for path in sorted(inside)[:9]),
+            "Name the same data set in each of them",
+        )
+    open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return the path of a file, and the path inside it after two colons; a file whose name has colons is that file."""
+    ends = [match.start() for match in re.finditer("::", name)]
+    there = [end for end in (len(name), *reversed(ends)) if os.path.lexists(name[:end])]
+    files = (end for end in there if not name[:end].endswith("/"))
+    fitting = (end for end in (*ends, len(name)) if _is_pattern(Path(name[:end])))
+    end = next(chain(files, fitting, there), ends[0] if ends else len(name))
+    return name[:end], name[end + 2 :]
+
+
+def _is_pattern(place: Path) -> bool:
+    """Tell whether a path that is not there is a pattern for the files of a folder that is."""
+    return any(sign in place.name for sign in _WILD) and not os.path.lexists(place) and place.parent.is_dir()
+
+
+def _check_folder(place: Path) -> None:
+    """Refuse a pattern for folders: only the last part of a path may be one."""
+    if any(sign in str(place.parent) for sign in _WILD) and not os.path.lexists(place.parent):
+        raise SourceError(
+            "there is no such folder",
+            str(place.parent),
+            "a folder, and a pattern for the names in it only",
+            str(place),
+            "Name the folder without * ? or [",
+        )
+
+
 def _matching(pattern: Path) -> list[Path]:
-    """Return the files that a pattern with ``*``, ``?``, ``[]`` or ``**`` stands for."""
-    fixed = next(k for k, part in enumerate(pattern.parts) if any(sign in part for sign in _WILD))
-    found = Path(*pattern.parts[:fixed]).glob(str(Path(*pattern.parts[fixed:])))
-    return [file for file in found if file.is_file()]
+    """Return the files whose names fit a pattern of ``*``, ``?`` or ``[]``; hidden ones where it begins with a dot."""
+    with os.scandir(pattern.parent) as found:
+        names = [item.name for item in found if fnmatch.fnmatchcase(item.name, pattern.name) and not item.is_dir()]
+    return [pattern.parent / name for name in names if name.startswith(".") <= pattern.name.startswith(".")]
+
+
+def _by_number(files: list[Path]) -> list[Path]:
+    return sorted(files, key=lambda file: natural_key(file.name))
 
 
 def _readable(folder: Path) -> list[Path]:
@@ -151,13 +218,8 @@ def _readable(folder: Path) -> list[Path]:
     return files
 
 
-def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
-    if not path.exists():
-        raise SourceError(
-            "there is no such file",
-            str(path),
-            remedy="Check the path; on a cluster every worker must see it under the same name",
-        )
+def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
+    checked_file(path, permit)
     suffix = path.suffix.lower()
     declared = settings.raw_shape is not None and settings.raw_dtype is not None
     opener = READERS.get(suffix, open_raw if declared else None)
@@ -179,4 +241,5 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
             f"the path {inner}",
             f"Open {path}",
         )
-    return opener(path, inner, settings)
+    with reading(str(path)):
+        return open_hdf5(path, inner, settings, permit=permit) if opener is open_hdf5 else opener(path, inner, settings)

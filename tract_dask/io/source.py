@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -9,10 +14,13 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError
+from ..errors import MissingSourceError, SourceError, TractError
 
 Frames: TypeAlias = NDArray[Any]
 """An array (frames, y, x)."""
+
+Permit: TypeAlias = Callable[[Path], object]
+"""Called with the resolved path of every file before it is opened; raises to refuse it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ class FrameSource(Protocol):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that hold the frames, in order."""
+        """All files that the frames come from, in order: also those behind the links of an HDF5 file."""
 
     @property
     def format(self) -> str:
@@ -74,6 +82,13 @@ class FrameSource(Protocol):
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
+
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside their file; empty where the file is the movie."""
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
 
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
@@ -98,34 +113,84 @@ class Source:
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
     metadata: SourceMetadata
+    inside: str = ""
 
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return False
 
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included): all, where that is not known."""
+        return slice(None)
+
     def read(self, start: int, stop: int) -> Frames:
-        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
-        raise NotImplementedError
+        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x).
+
+        Raises
+        ------
+        SourceError
+            For whatever is wrong with the file.
+        """
+        start, stop, _ = slice(start, stop).indices(self.shape[0])
+        with reading(self.path, f"the file cannot be read at frames {start} to {stop - 1}"):
+            frames = self._read(start, stop)
+        expected = (max(0, stop - start), *self.shape[1:])
+        if frames.shape != expected:
+            raise SourceError(
+                "the file has changed since it was opened",
+                self.path,
+                f"{expected[0]} frames from frame {start} on, each {expected[1]} x {expected[2]}",
+                " x ".join(map(str, frames.shape)),
+                "Wait until it has been written, then begin again",
+            )
+        self._check_exact(start, frames)
+        return frames
 
     def read_into(self, start: int, frames: Frames) -> None:
-        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
+        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on.
+
+        Raises
+        ------
+        SourceError
+            For whatever is wrong with the file.
+        """
         frames[...] = self.read(start, start + len(frames))
+
+    def _check_exact(self, start: int, frames: Frames) -> None:
+        """Refuse whole numbers that sums and fits, which are done in float64, would round without a word."""
+        if self.dtype.kind not in "iu" or self.dtype.itemsize < 8 or not frames.size:
+            return
+        low, high = int(frames.min()), int(frames.max())
+        if max(-low, high) > _EXACT:
+            raise SourceError(
+                f"frames {start} to {start + len(frames) - 1} hold whole numbers that float64 cannot tell apart",
+                self.path,
+                f"values from -{_EXACT:,} to {_EXACT:,}",
+                f"values from {low:,} to {high:,}",
+                "Subtract an offset or divide by a factor, and save the movie as float64 or uint32",
+            )
+
+    def _read(self, start: int, stop: int) -> Frames:
+        """Return frames as :meth:`read` does; what libraries raise becomes a SourceError there."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
 
 
 def checked_dtype(dtype: np.dtype[Any], where: str) -> np.dtype[Any]:
-    """Return ``dtype`` in the machine's byte order.
+    """Return the type in which pixels are read, in the machine's byte order.
+
+    Types that few programs compute with are widened, exactly: float16 to float32, true and false to uint8.
 
     Raises
     ------
     SourceError
-        Where a pixel is not one integer or floating-point number of at most 8 bytes.
+        Where a pixel is not one integer or floating-point number of at most 8 bytes, or one bit.
     """
-    if dtype.kind not in "iuf" or dtype.itemsize > 8:
-        kinds = {"c": "complex numbers", "b": "true or false", "V": "several values a pixel"}
+    if dtype.kind not in "iufb" or dtype.itemsize > 8:
+        kinds = {"c": "complex numbers", "V": "several values a pixel", "f": "extended precision"}
         got = f"{dtype} ({kinds[dtype.kind]})" if dtype.kind in kinds else str(dtype)
         raise SourceError(
             "the pixels cannot be used as intensities",
@@ -134,7 +199,14 @@ def checked_dtype(dtype: np.dtype[Any], where: str) -> np.dtype[Any]:
             got,
             "Convert the movie, for example to its modulus, and save it as uint16 or float32",
         )
-    return dtype.newbyteorder("=")
+    return np.dtype({"b1": "u1", "f2": "f4"}.get(dtype.str[1:], dtype)).newbyteorder("=")
+
+
+def widened(frames: Frames, dtype: np.dtype[Any]) -> Frames:
+    """Return frames as stored (any order of bytes and of axes) as an array of a type from :func:`checked_dtype`."""
+    if frames.dtype.kind == "b":
+        frames = frames.view(np.uint8) != 0  # what is not 0 is true, also where a byte is not 1
+    return np.ascontiguousarray(frames, dtype)
 
 
 def checked_shape(shape: tuple[int, ...], where: str) -> tuple[int, int, int]:
@@ -158,13 +230,147 @@ def checked_shape(shape: tuple[int, ...], where: str) -> tuple[int, int, int]:
         raise SourceError(
             "the movie has no frames", where, "at least one frame", f"shape {shape}", "Check how it was exported"
         )
+    if n_frames > MOST_FRAMES:
+        raise SourceError(
+            "the number of frames makes no sense",
+            where,
+            f"at most {MOST_FRAMES:,}",
+            f"{n_frames:,}",
+            "The header is damaged: make the copy or the export again",
+        )
     return n_frames, n_y, n_x
 
 
-def unreadable(where: str, error: OSError, what: str = "the file cannot be read") -> SourceError:
-    """Return the error for what the system, or a library on its behalf, says of a file."""
-    reason = error.strerror or " ".join(str(error).split())
-    return SourceError(what, where, got=reason, remedy="Check that it is there, its permissions, and its disk")
+FRAME_BYTES, RATIO = 64 << 20, 1000
+"""A frame may claim so many bytes, and so many times the bytes of its file, before it is believed to be damaged."""
+
+MOST_FRAMES = 2**31 - 1
+"""More are a damaged header."""
+
+_EXACT = 2**53
+
+
+def checked_claim(n_bytes: int, size: int, where: str, what: str = "one frame") -> None:
+    """Check what a compressed file says of its own size before so much memory is taken; ``size`` is the file's.
+
+    Raises
+    ------
+    SourceError
+        Where no compression makes so much of so little.
+    """
+    if n_bytes > FRAME_BYTES + RATIO * size:
+        raise SourceError(
+            f"{what} would be far larger than the file can hold",
+            where,
+            f"at most {FRAME_BYTES + RATIO * size:,} bytes from a file of {size:,}",
+            f"{n_bytes:,} bytes",
+            "The header is damaged: make the copy or the export again",
+        )
+
+
+def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
+    """Return the status of a file that may be opened, without opening it: to open a pipe would take forever.
+
+    Raises
+    ------
+    SourceError
+        Where it is not there, cannot be looked at, is not a file, or is empty.
+    """
+    if permit is not None:
+        permit(Path(os.path.realpath(path)))
+    with reading(str(path), "the file cannot be opened"):
+        try:
+            status = path.stat()
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise MissingSourceError(
+                f"the link leads to {path.readlink()}, which is not there"
+                if path.is_symlink()
+                else "there is no such file",
+                str(path),
+                remedy="Check the path; on a cluster every worker must see it under the same name",
+            ) from error
+    kind = next((name for test, name in _KINDS.items() if test(status.st_mode)), None)
+    if kind or not status.st_size:
+        raise SourceError(
+            "the file is empty" if kind is None else "this is not a file",
+            str(path),
+            "a file that holds a movie",
+            kind or "no bytes",
+            "Name the movie's file" if kind else "Check the copy: it may not have begun",
+        )
+    return status
+
+
+_KINDS: dict[Callable[[int], bool], str] = {
+    stat.S_ISDIR: "a folder",
+    stat.S_ISFIFO: "a pipe",
+    stat.S_ISSOCK: "a socket",
+    stat.S_ISCHR: "a device",
+    stat.S_ISBLK: "a device",
+}
+
+
+@contextmanager
+def reading(
+    where: str, what: str = "the file cannot be read", remedy: str = "Make the copy or the export again"
+) -> Iterator[None]:
+    """Turn whatever goes wrong in this block into an error of ours: the border between libraries and the rest.
+
+    Raises
+    ------
+    SourceError
+        For what the system and the libraries say of a file; ours pass as they are.
+    TractError
+        Where there is not enough memory, which is not the file's fault.
+    """
+    try:
+        yield
+    except TractError:
+        raise
+    except OSError as error:
+        raise unreadable(where, _plain(error), what, remedy) from _plain(error)
+    except MemoryError as error:
+        raise TractError(
+            "memory ran out while the movie was read",
+            where,
+            got=words(error),
+            remedy="Give each worker more memory, for example by fewer workers",
+        ) from error
+    except Exception as error:
+        raise SourceError(what, where, got=words(error), remedy=remedy) from error
+
+
+def words(error: BaseException) -> str:
+    """Return what an error says, in one line that is not too long; its name where it says nothing."""
+    text = " ".join(str(error).split())
+    return text[:300] or type(error).__name__
+
+
+def _plain(error: OSError) -> OSError:
+    """Return the system's own error where HDF5 hides its number in a sentence."""
+    found = re.search(r"errno = (\d+)", str(error)) if error.errno is None else None
+    return OSError(int(found[1]), os.strerror(int(found[1]))) if found and int(found[1]) else error
+
+
+_BUSY = (
+    ("unable to lock file", "another program has locked the file", "Wait until it is written, or close it there"),
+    (
+        "already open for write",
+        "another program is writing the file, or ended before it had written it",
+        "Wait until it is written; if nothing writes it any more, run h5clear -s on a copy",
+    ),
+)
+"""What HDF5 says of a file that is being written, and what we say."""
+
+
+def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceError:
+    """Return the error for what the system says of a file, or, with ``remedy``, what a library says of its content."""
+    for sign, said, advice in _BUSY:
+        if sign in str(error):
+            return SourceError(said, where, got=words(error), remedy=advice)
+    if error.errno is not None:
+        remedy = "Check that it is there, its permissions, and its disk"
+    return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
 def truncated(where: str, place: str, expected: int, got: int) -> SourceError:

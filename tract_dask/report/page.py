@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .. import plots, stores
 from ..analysis.jumps import change_points
 from ..errors import TractError
-from ..provenance import stage_key
+from ..provenance import digest_of
 from ..settings import RunSettings, Settings
 from ..web import STATIC, bundle
 from . import interactive
@@ -91,7 +91,7 @@ def _key(folder: Path) -> str:
     """Return the key of a report: all that the tracks say of themselves, and the settings of the run."""
     about = json.dumps(stores.attributes(folder / "results.zarr"), sort_keys=True)
     settings = folder / "run.toml"
-    return stage_key(about, settings.read_bytes() if settings.exists() else b"")
+    return digest_of(about, settings.read_bytes() if settings.exists() else b"")
 
 
 def _events(path: Path) -> list[dict[str, Any]]:

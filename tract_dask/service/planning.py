@@ -191,7 +191,7 @@ def check_source(place: str, settings: RunSettings, folder: Path | None) -> Chec
     with closing(open_source(place, settings.source, settings.metadata)) as source:
         check_inputs(source, settings)
         if folder is not None and folder.exists():
-            check_output(Outputs(folder), source, overwrite=False)
+            check_output(Outputs(folder), source, settings, overwrite=False)
         return Checked(source.shape, source.dtype.name, plan_run(source.shape, source.dtype, settings))
 
 
