@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"journal", "provenance", "shards", "stores"}
-MOVIE = STORES | {"io", "movie", "kernels"}
+MOVIE = STORES | {"io", "movie", "kernels", "pixel_range"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
 
@@ -37,6 +37,7 @@ ALLOWED = {
     "seeds": GROUND,
     "windows": {"errors"},
     "vacuum": GROUND | {"kernels"},
+    "pixel_range": {"errors"},
     "filtering": MOVIE,
     "measure": MOVIE | {"filtering"},
     "results": STORES | {"shard_files"},

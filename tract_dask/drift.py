@@ -30,6 +30,7 @@ from . import schema
 from .errors import SettingsError, SourceError
 from .journal import Payload
 from .kernels.alignment import Template, align
+from .kernels.magnitude import unit_of
 from .kernels.registration import (
     Floats,
     Image,
@@ -208,6 +209,8 @@ class Level:
         Search range, px of the level.
     search_fold
         Further binning for the search.
+    unit
+        By which pixels are divided (:func:`unit_of`).
     """
 
     stored: int
@@ -216,6 +219,7 @@ class Level:
     spectrum: Spectrum
     search: float
     search_fold: int
+    unit: float
 
     @property
     def bin(self) -> int:
@@ -301,6 +305,8 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     bins = sorted({1, *movie.bins})
     stored = next((b for b in bins if (ny // b) * (nx // b) <= LEVEL_PIXELS), bins[-1])
     samples = _samples(movie, stored)
+    unit = unit_of(samples[0])
+    samples = [_in_units(image, unit) for image in samples]
     spectrum, fold = measure_spectrum(samples), 1
     while spectrum.loss(2) < FOLD_LOSS and min(ny, nx) // (stored * fold) >= 2 * SMALLEST_SIDE:
         fold *= 2
@@ -312,7 +318,7 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     search_fold = 1
     while spectrum.loss(2 * search_fold) < SEARCH_LOSS and min(shape) // search_fold >= 2 * SMALLEST_SIDE:
         search_fold *= 2
-    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold)
+    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold, unit)
 
 
 def _samples(movie: Movie, stored: int) -> list[Image]:
@@ -327,7 +333,14 @@ def _samples(movie: Movie, stored: int) -> list[Image]:
 def _frames(movie: Movie, level: Level, shard: Shard) -> Iterator[Image | None]:
     """Yield the frames of a shard on a level, less the movie's mean; None for one that holds nothing."""
     for image in _read(movie, level.stored, shard):
-        yield None if image is None else fold_image(image, level.fold) - np.float32(level.spectrum.mean)
+        if image is None:
+            yield None
+        else:
+            yield fold_image(_in_units(image, level.unit), level.fold) - np.float32(level.spectrum.mean)
+
+
+def _in_units(image: Image, unit: float) -> Image:
+    return image if unit == 1 else (image / unit).astype(np.float32)
 
 
 def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:

@@ -19,6 +19,7 @@ from .journal import Journal, Payload, journal_beside
 from .kernels.gaussian import blurred
 from .measure import Floats, Job, measure
 from .movie import Movie
+from .pixel_range import check_pixels
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
@@ -74,6 +75,8 @@ def fit_columns(
     ------
     SettingsError
         Where a window is larger than the frame, the vacuum box leaves it, or counts (``poisson``) are negative.
+    InputError
+        Where float32 does not hold the pixels (:func:`tract_dask.pixel_range.check_pixels`).
     """
     import dask.array as da  # takes its time, and workers do not need it
 
@@ -198,6 +201,7 @@ def prepare(
     elif summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
+    check_pixels(statistics, str(movie.path))
     bad = statistics["frame_bad_pixels"].to_numpy() > 0
     if settings.estimator == "poisson":
         _check_counts(statistics["frame_min"].to_numpy())
