@@ -17,6 +17,7 @@ RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
 ALLOWED = {
     "errors": set(),
     "lazy": set(),
+    "system": {"errors"},
     "progress": set(),
     "schema": {"errors"},
     "settings": {"errors"},
@@ -81,7 +82,7 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
+    | {"console", "editor", "system", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 
