@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"journal", "provenance", "shards", "stores"}
-MOVIE = STORES | {"io", "movie", "kernels", "pixel_range"}
+MOVIE = STORES | {"io", "movie", "kernels", "pixel_range", "processor"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
 
@@ -21,7 +21,8 @@ ALLOWED = {
     "progress": set(),
     "schema": {"errors"},
     "settings": {"errors"},
-    "provenance": {"settings"},
+    "processor": {"kernels"},
+    "provenance": {"processor", "settings"},
     "stores": {"errors", "schema"},
     "shards": set(),
     "journal": {"shards", "stores"},

@@ -44,6 +44,7 @@ from .kernels.registration import (
 from .kernels.sums import Whole, add_shifted
 from .movie import Movie
 from .passes import Passes, save_array
+from .processor import processor
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
@@ -102,8 +103,8 @@ def estimate_drift(
     Returns
     -------
     xr.Dataset
-        :data:`schema.DRIFT`, with attributes ``method``, ``pixel_size_pm``, and for method auto ``bin``,
-        ``search_px`` and ``period_px`` (None: no lattice found), in px of the movie.
+        :data:`schema.DRIFT`, with attributes ``method``, ``pixel_size_pm``, and for method auto ``processors`` (kinds
+        that took part), ``bin``, ``search_px`` and ``period_px`` (None: no lattice found), in px of the movie.
 
     Raises
     ------
@@ -284,6 +285,7 @@ def _measure_drift(
         movie,
         method="auto",
         bin=level.bin,
+        processors=sorted({payload["processor"] for payload in payloads.values()}),
         search_px=level.search * level.bin,
         period_px=level.spectrum.period_px * level.bin if np.isfinite(level.spectrum.period_px) else None,
     )
@@ -484,7 +486,7 @@ def _refine_shard(movie: Movie, level: Level, follow: Path, folder: Path, shard:
         if image is not None:
             fit = align(image, template, tuple(track.drift[k]), limit=level.search / 2)
             drift[k], quality[k] = (fit.dy, fit.dx), max(0.0, fit.correlation)
-    return {"drift": drift, "quality": quality}
+    return {"drift": drift, "quality": quality, "processor": processor()}
 
 
 def _mean_of_others(level: Level, follow: Path, folder: Path, shard: Shard) -> Template:

@@ -20,7 +20,8 @@ from .kernels.gaussian import blurred
 from .measure import Floats, Job, measure
 from .movie import Movie
 from .pixel_range import check_pixels
-from .progress import ShardDone, Sink, StageDone, StageStarted, silent
+from .processor import processor, widths
+from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
 from .settings import FitSettings, from_toml
@@ -159,10 +160,12 @@ def fit_movie(
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
     summary = dict.fromkeys(("fits", "accepted", "bad_frames"), 0)
+    processors: set[str] = set()
 
     def add(shard: Shard, payload: Payload) -> None:
         for name in summary:
             summary[name] += payload[name]
+        processors.add(payload["processor"])
 
     stream_shards(
         partial(_fit_task, movie, path, key),
@@ -173,8 +176,11 @@ def fit_movie(
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
     )
-    stores.update_attributes(path, complete=True, summary=summary)
+    stores.update_attributes(path, complete=True, summary=summary, processors=sorted(processors))
     journal.remove()
+    if len(mixed := widths(processors)) > 1:
+        lanes = " and ".join(map(str, mixed))
+        on_event(Warned(f"processors with vectors of {lanes} numbers took part: last digits depend on which did what"))
     on_event(
         StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
     )
@@ -266,6 +272,7 @@ def _fit_task(movie: Movie, path: Path, key: str, shard: Shard) -> Payload:
         "fits": int(fitted.sum()),
         "accepted": int(((values["status"] & REJECTED) == 0).sum()),
         "bad_frames": int(job.bad[shard.start : shard.stop].sum()),
+        "processor": processor(),
     }
 
 

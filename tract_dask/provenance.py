@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from .processor import processor
 from .settings import Settings, to_toml
 
 _SAMPLE_BYTES = 1 << 20
@@ -53,6 +54,7 @@ def provenance(key: str, settings: Settings, source: str = "") -> dict[str, Any]
         "settings": to_toml(settings),
         "source": source,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": processor(),
         "versions": {"python": platform.python_version()}
         | {name: importlib.metadata.version(name) for name in packages},
     }
