@@ -20,8 +20,8 @@ from tract_dask.settings import ConvertSettings, FitSettings
 
 SAME_PX = 1e-3
 """Positions; a hundredth of their errors."""
-SAME_SHARE = 1e-3
-"""Amplitudes, noise and intensities."""
+SAME_SHARE = 5e-3
+"""Noise, intensities and their errors."""
 SAME_FITS = 0.99
 """Share of the fits with the same flags: a fit at the edge of a flag may fall on either side."""
 
