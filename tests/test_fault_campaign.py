@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 
 import pytest
 
@@ -25,17 +25,7 @@ for _ in range(4):
 """
 
 
-@pytest.fixture(scope="module")
-def campaign():
-    """The script as a module."""
-    sys.dont_write_bytecode, before = True, sys.dont_write_bytecode
-    spec = spec_from_loader("fault_campaign", SourceFileLoader("fault_campaign", str(ROOT / "scripts/fault_campaign")))
-    module = module_from_spec(spec)
-    sys.modules["fault_campaign"] = module  # dataclasses look themselves up there
-    spec.loader.exec_module(module)
-    sys.dont_write_bytecode = before
-    yield module
-    del sys.modules["fault_campaign"]
+campaign = SimpleNamespace(**runpy.run_path(str(ROOT / "scripts" / "fault_campaign")))
 
 
 @pytest.mark.parametrize(
@@ -48,21 +38,27 @@ def campaign():
         (None, "", "HANG"),
     ],
 )
-def test_how_a_run_ended_is_told_by_its_code_and_words(campaign, code, text, fault):
+def test_how_a_run_ended_is_told_by_its_code_and_words(code, text, fault):
     assert campaign.Ended(code, text).fault == fault
 
 
-def test_the_advice_of_an_error_is_followed(campaign, tmp_path):
-    for name in ("movie.zarr", "movie.zarr.journal", "sum.zarr"):
-        (tmp_path / name).mkdir()
-    assert campaign.follow(f"Error: {tmp_path}/movie.zarr/0/c.1: a bit. Remove the store.", tmp_path) == ()
-    assert [path.name for path in tmp_path.iterdir()] == ["sum.zarr"]
-    assert campaign.follow("the disk is full: make room", tmp_path) == ()
-    assert campaign.follow("say --overwrite to discard it", tmp_path) == ("--overwrite",)
-    assert (tmp_path / "sum.zarr").exists()
+def test_the_advice_of_an_error_is_followed(tmp_path):
+    output = tmp_path / "out"
+    for name in ("movie.zarr", "results.zarr", "columns.zarr", "sum.zarr"):
+        (output / name).mkdir(parents=True)
+    (output / "columns.csv").touch()
+    assert campaign.follow(f"Error: {output}/movie.zarr/0/c.1: a bit. Remove the store.", output) == ()
+    assert campaign.follow(f"a bit. Remove {output}/results.zarr and run the command again.", output) == ()
+    advice = f"Remove {output}/columns.zarr, move columns.csv beside it elsewhere, and run it again."
+    assert campaign.follow(advice, output) == ()
+    assert [path.name for path in output.iterdir()] == ["sum.zarr"]
+    assert campaign.follow("the disk is full: make room", output) == ()
+    assert campaign.follow("Remove /etc/passwd", output) == ()
+    assert campaign.follow("say --overwrite to discard it", output) == ("--overwrite",)
+    assert (output / "sum.zarr").exists()
 
 
-def test_other_numbers_without_a_word_are_the_worst(campaign, tmp_path):
+def test_other_numbers_without_a_word_are_the_worst(tmp_path):
     case = campaign.Case("flipped bit", "fit", tmp_path, Random(0))
     assert campaign.judge(case, []) == "identical"
     case.said.append("Error: damaged")
@@ -70,7 +66,7 @@ def test_other_numbers_without_a_word_are_the_worst(campaign, tmp_path):
     assert campaign.judge(case, ["results.zarr/fit"]) == "SILENTLY DIFFERENT"
 
 
-def test_harms_change_what_they_say(campaign, tmp_path):
+def test_harms_change_what_they_say(tmp_path):
     file, case = tmp_path / "c.0", campaign.Case("flipped bit", "fit", tmp_path, Random(0))
     for _ in range(20):
         file.write_bytes(bytes(5000))
@@ -83,7 +79,7 @@ def test_harms_change_what_they_say(campaign, tmp_path):
 
 
 @pytest.mark.parametrize(("once", "said"), [(True, ["written"] * 3), (False, ["written", *["Input/output error"] * 2])])
-def test_the_shim_lets_writes_of_one_file_fail(campaign, tmp_path, once, said):
+def test_the_shim_lets_writes_of_one_file_fail(tmp_path, once, said):
     shim = campaign.compiled_shim(tmp_path)
     assert shim, "this test needs a C compiler"
     environment = os.environ | {
