@@ -10,18 +10,20 @@ PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"damage", "disk", "journal", "keyed", "provenance", "shards", "stamps", "stores"}
-MOVIE = STORES | {"io", "movie", "kernels"}
+MOVIE = STORES | {"io", "movie", "kernels", "pixel_range", "processor"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "dispatch", "stages", "pipeline", "tasks", "tls"}
 
 ALLOWED = {
     "errors": set(),
     "lazy": set(),
+    "system": {"errors"},
     "progress": set(),
     "schema": {"errors"},
     "settings": {"errors"},
     "keyed": {"settings"},
-    "provenance": {"keyed", "settings"},
+    "processor": {"kernels"},
+    "provenance": {"keyed", "processor", "settings"},
     "stamps": {"errors"},
     "disk": set(),
     "stores": {"damage", "disk", "errors", "schema", "shard_files"},
@@ -44,6 +46,7 @@ ALLOWED = {
     "seeds": GROUND,
     "windows": {"errors"},
     "vacuum": GROUND | {"kernels"},
+    "pixel_range": {"errors"},
     "filtering": MOVIE,
     "measure": MOVIE | {"filtering"},
     "parts": STORES | {"shard_files", "tasks"},
@@ -91,8 +94,8 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "interrupts", "lazy", "options", "remote", "report", "simulate", "terminal"}
-    | {"verify"},
+    | {"console", "editor", "hosting", "interrupts", "lazy", "options", "remote", "report", "simulate", "system"}
+    | {"terminal", "verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

@@ -31,6 +31,7 @@ from .progress import STAGES
 from .remote import cancel, jobs, submit, watch
 from .settings import RunSettings
 from .simulate.settings import PRESETS, Microscope, SpecimenSettings
+from .system import check_system
 
 if TYPE_CHECKING:
     from .pipeline import Plan, RunOutcome
@@ -54,6 +55,7 @@ class Group(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; turn what it raises into an exit code."""
         try:
+            check_system()
             with _terminated_as_interrupted():
                 return super().invoke(ctx)
         except KeyboardInterrupt:

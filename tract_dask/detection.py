@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 from . import schema
 from .errors import InputError, SettingsError
 from .journal import Payload
+from .kernels.magnitude import unit_of
 from .kernels.peaks import centroids, local_maxima
 from .lattice import Relief, binned, find_lattice, pixel_noise, relief
 from .movie import Movie
@@ -264,7 +265,9 @@ def detect_columns(
 
 
 def _filled(image: Floats, valid: Mask) -> Floats:
-    """Return the image with the median of its valid pixels where it is not valid."""
+    """Return the image in units of :func:`unit_of`, with the median of its valid pixels where it is not valid."""
+    unit = unit_of(image)
+    image = image if unit == 1 else image / unit
     return image if valid.all() else np.where(valid, image, np.median(image[valid]))
 
 

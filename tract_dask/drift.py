@@ -30,6 +30,7 @@ from . import schema
 from .errors import SettingsError, SourceError
 from .journal import Fields, Payload
 from .kernels.alignment import Template, align
+from .kernels.magnitude import unit_of
 from .kernels.registration import (
     Floats,
     Image,
@@ -44,6 +45,7 @@ from .kernels.sums import Whole, add_shifted
 from .keyed import counted
 from .movie import Movie
 from .passes import Passes, load_saved, save_array
+from .processor import processor
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
@@ -106,8 +108,8 @@ def estimate_drift(
     Returns
     -------
     xr.Dataset
-        :data:`schema.DRIFT`, with attributes ``method``, ``pixel_size_pm``, and for method auto ``bin``,
-        ``search_px`` and ``period_px`` (None: no lattice found), in px of the movie.
+        :data:`schema.DRIFT`, with attributes ``method``, ``pixel_size_pm``, and for method auto ``processors`` (kinds
+        that took part), ``bin``, ``search_px`` and ``period_px`` (None: no lattice found), in px of the movie.
 
     Raises
     ------
@@ -213,6 +215,8 @@ class Level:
         Search range, px of the level.
     search_fold
         Further binning for the search.
+    unit
+        By which pixels are divided (:func:`unit_of`).
     """
 
     stored: int
@@ -221,6 +225,7 @@ class Level:
     spectrum: Spectrum
     search: float
     search_fold: int
+    unit: float
 
     @property
     def bin(self) -> int:
@@ -285,6 +290,7 @@ def _measure_drift(
         movie,
         method="auto",
         bin=level.bin,
+        processors=sorted({payload["processor"] for payload in payloads.values()}),
         search_px=level.search * level.bin,
         period_px=level.spectrum.period_px * level.bin if np.isfinite(level.spectrum.period_px) else None,
     )
@@ -306,6 +312,8 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     bins = sorted({1, *movie.bins})
     stored = next((b for b in bins if (ny // b) * (nx // b) <= LEVEL_PIXELS), bins[-1])
     samples = _samples(movie, stored)
+    unit = unit_of(samples[0])
+    samples = [_in_units(image, unit) for image in samples]
     spectrum, fold = measure_spectrum(samples), 1
     while spectrum.loss(2) < FOLD_LOSS and min(ny, nx) // (stored * fold) >= 2 * SMALLEST_SIDE:
         fold *= 2
@@ -317,7 +325,7 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     search_fold = 1
     while spectrum.loss(2 * search_fold) < SEARCH_LOSS and min(shape) // search_fold >= 2 * SMALLEST_SIDE:
         search_fold *= 2
-    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold)
+    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold, unit)
 
 
 def _samples(movie: Movie, stored: int) -> list[Image]:
@@ -332,7 +340,14 @@ def _samples(movie: Movie, stored: int) -> list[Image]:
 def _frames(movie: Movie, level: Level, shard: Shard) -> Iterator[Image | None]:
     """Yield the frames of a shard on a level, less the movie's mean; None for one that holds nothing."""
     for image in _read(movie, level.stored, shard):
-        yield None if image is None else fold_image(image, level.fold) - np.float32(level.spectrum.mean)
+        if image is None:
+            yield None
+        else:
+            yield fold_image(_in_units(image, level.unit), level.fold) - np.float32(level.spectrum.mean)
+
+
+def _in_units(image: Image, unit: float) -> Image:
+    return image if unit == 1 else (image / unit).astype(np.float32)
 
 
 def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
@@ -476,7 +491,7 @@ def _refine_shard(movie: Movie, level: Level, follow: Path, folder: Path, shard:
         if image is not None:
             fit = align(image, template, tuple(track.drift[k]), limit=level.search / 2)
             drift[k], quality[k] = (fit.dy, fit.dx), max(0.0, fit.correlation)
-    return {"drift": drift, "quality": quality}
+    return {"drift": drift, "quality": quality, "processor": processor()}
 
 
 def _mean_of_others(level: Level, follow: Path, folder: Path, shard: Shard) -> Template:

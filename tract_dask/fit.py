@@ -21,6 +21,8 @@ from .keyed import counted
 from .measure import Floats, Job, measure
 from .movie import Movie
 from .parts import DamagedPartError, join, write
+from .pixel_range import check_pixels
+from .processor import processor, widths
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
@@ -80,6 +82,8 @@ def fit_columns(
     ------
     SettingsError
         Where a window is larger than the frame, the vacuum box leaves it, or counts (``poisson``) are negative.
+    InputError
+        Where float32 does not hold the pixels (:func:`tract_dask.pixel_range.check_pixels`).
     """
     import dask.array as da  # takes its time, and workers do not need it
 
@@ -162,7 +166,7 @@ def fit_movie(
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
     for attempt in range(_ATTEMPTS):
-        summary = _fit_shards(movie, path, journal, client, on_event)
+        summary, processors = _fit_shards(movie, path, journal, client, on_event)
         try:
             join(path, journal, client, on_event, attempt)
             break
@@ -170,21 +174,28 @@ def fit_movie(
             if attempt == _ATTEMPTS - 1:
                 raise
             on_event(Warned(f"{error.what}: they are made anew"))
-    results.finish(path, summary=summary)
+    results.finish(path, summary=summary, processors=sorted(processors))
     journal.remove()
+    if len(mixed := widths(processors)) > 1:
+        lanes = " and ".join(map(str, mixed))
+        on_event(Warned(f"processors with vectors of {lanes} numbers took part: last digits depend on which did what"))
     on_event(
         StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
     )
     return FitSummary(**summary)
 
 
-def _fit_shards(movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink) -> dict[str, int]:
-    """Fit the shards that are not on disk; return the counts of all."""
+def _fit_shards(
+    movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink
+) -> tuple[dict[str, int], set[str]]:
+    """Fit the shards that are not on disk; return the counts of all, and the processors that took part."""
     summary = dict.fromkeys(_COUNTS, 0)
+    processors: set[str] = set()
 
     def add(shard: Shard, payload: Payload) -> None:
         for name in summary:
             summary[name] += payload[name]
+        processors.add(payload["processor"])
 
     stream_shards(
         partial(_fit_task, movie, path, journal.key, journal.path),
@@ -197,7 +208,7 @@ def _fit_shards(movie: Movie, path: Path, journal: Journal, client: Client | Non
         file=str(movie.path),
         on_event=on_event,
     )
-    return summary
+    return summary, processors
 
 
 def prepare(
@@ -220,6 +231,7 @@ def prepare(
     elif summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
+    check_pixels(statistics, str(movie.path))
     bad = statistics["frame_bad_pixels"].to_numpy() > 0
     if settings.estimator == "poisson":
         _check_counts(statistics["frame_min"].to_numpy())
@@ -285,6 +297,7 @@ def _fit_task(movie: Movie, path: Path, key: str, run: Path, shard: Shard) -> Pa
         "fits": int(fitted.sum()),
         "accepted": int(((values["status"] & REJECTED) == 0).sum()),
         "bad_frames": int(job.bad[shard.start : shard.stop].sum()),
+        "processor": processor(),
     }
 
 

@@ -409,6 +409,7 @@ def _stages(
     yield "drift"
     summed = sum_stage(movie, drift, outputs.sum, workers, send)
     yield "sum"
+    session.finish_aside()  # it imports what comes next: two threads could meet in packages that import each other
     columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
     made.columns = columns
     yield "columns"

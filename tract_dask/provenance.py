@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .keyed import plain
+from .processor import processor
 from .settings import Settings, to_toml
 
 ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
@@ -108,6 +109,7 @@ def provenance(key: str, settings: Settings, source: str = "") -> dict[str, Any]
         "settings": to_toml(settings),
         "source": source,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": processor(),
         "versions": {"python": platform.python_version()}
         | {name: importlib.metadata.version(name) for name in packages},
     }

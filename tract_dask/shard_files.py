@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import google_crc32c
 import imagecodecs
+import imagecodecs._blosc  # which imagecodecs would import in the first tasks, several threads at once
 import numpy as np
 from numpy.typing import NDArray
 

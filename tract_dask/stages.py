@@ -28,6 +28,7 @@ from .io import FrameSource
 from .journal import journal_beside, remove_journal
 from .keyed import counted
 from .movie import Movie, open_movie
+from .pixel_range import check_pixels
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import Status
@@ -72,7 +73,10 @@ def convert_stage(
         on_event=on_event,
         overwrite=overwrite,
     )
-    return open_movie(path)
+    movie = open_movie(path)
+    if coarse := check_pixels(movie.statistics(), source.path):
+        on_event(Warned(coarse))
+    return movie
 
 
 def drift_stage(
