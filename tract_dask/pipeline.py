@@ -578,8 +578,8 @@ def check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> N
             ", ".join(others[:3]),
             "Choose another place, or say --overwrite",
         )
-    before = stores.attributes(outputs.movie).get("source", source.path)
-    if Path(before).absolute() != Path(source.path).absolute() and not overwrite:
+    before = source.path if overwrite else stores.attributes(outputs.movie).get("source", source.path)
+    if Path(before).absolute() != Path(source.path).absolute():
         raise DestinationError(
             "this folder holds the run of another movie",
             str(root),
