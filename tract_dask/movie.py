@@ -46,6 +46,15 @@ def open_movie(path: str | Path) -> Movie:
             "something else" if path.exists() else "nothing",
             "Convert the movie first",
         )
+    needed = ("shape", "complete", "frames_per_shard", "dtype", "key", "bins", *schema.CALIBRATION)
+    if lacking := [name for name in needed if name not in present]:
+        raise MissingStoreError(
+            "this movie store is of another version",
+            str(path),
+            "all that this version knows of a movie",
+            f"no {', '.join(lacking)}",
+            "Convert the movie again",
+        )
     shape = tuple(present["shape"])
     if not present["complete"]:
         n_shards = len(split(shape[0], present["frames_per_shard"]))

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from time import monotonic, sleep
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from . import disk
-from .damage import CHECKED, METADATA, damaged, read_json, reading
+from .damage import CHECKED, METADATA, damaged, read_json, reading, unreadable
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
 from .shard_files import CHUNK_KEYS, crc32c
@@ -70,7 +71,7 @@ def open_array(path: Path) -> zarr.Array[Any]:
     store, about = _store_around(path)
     _check_nodes(store, about, [path.relative_to(store).as_posix()])
     try:
-        with zarr.config.set(CHECKED if _is_whole(about) else {}), _opening(path):
+        with _configured(CHECKED if _is_whole(about) else {}), _opening(path):
             return zarr.open_array(str(path), mode="r", zarr_format=3)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError) as error:
         raise StoreError("there is no Zarr array here", str(path), remedy="Run the stage that writes it") from error
@@ -94,7 +95,7 @@ def attributes(path: Path) -> dict[str, Any]:
             raise damaged(file, "no metadata of tract_dask" if metadata else "no such file")
         return {}
     number, checksum = format_of(found), found.pop("checksum", None)
-    if (checksum is not None or number != 1) and checksum != _digest(metadata):
+    if (checksum is not None or number != 1) and checksum != digest(metadata):
         raise damaged(file, "its checksum is that of other data: it was damaged, or changed by another program")
     if number > FORMAT:
         version = found.get("versions", {}).get("tract_dask", "unknown")
@@ -138,12 +139,12 @@ def write_root(path: Path, metadata: dict[str, Any], changed: Collection[str] = 
     ours = metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {})
     known = ours.get("arrays")
     names = _nodes(path) if known is None else changed
-    ours["arrays"] = (known or {}) | {name: _digest(read_json(path / name / METADATA)) for name in names}
+    ours["arrays"] = (known or {}) | {name: digest(read_json(path / name / METADATA)) for name in names}
     ours["format"] = FORMAT
     ours.pop("checksum", None)
     metadata = json_ready(metadata)
     ours = metadata["attributes"][ATTRIBUTE]
-    ours["checksum"] = _digest(metadata)
+    ours["checksum"] = digest(metadata)
     write_aside(path / METADATA, json.dumps(metadata, indent=2).encode())
 
 
@@ -181,7 +182,7 @@ def _nodes(path: Path, inside: str = "") -> Iterator[str]:
                 yield from _nodes(path, f"{name}/")
 
 
-def _digest(metadata: dict[str, Any]) -> int:
+def digest(metadata: dict[str, Any]) -> int:
     """Return the CRC-32C of metadata, whatever their white space and the order of their names."""
     return crc32c(json.dumps(metadata, sort_keys=True, separators=(",", ":")).encode())
 
@@ -206,7 +207,7 @@ def _read_node(store: Path, about: Mapping[str, Any], name: str) -> dict[str, An
     found = read_json(file)
     if not found:
         raise damaged(file, "no such file", "is missing")
-    if _digest(found) != known.get(name, _digest(found)):
+    if digest(found) != known.get(name, digest(found)):
         raise damaged(file, "its checksum is that of other data")
     return found
 
@@ -216,6 +217,16 @@ def _is_whole(about: Mapping[str, Any]) -> bool:
     return format_of(about) >= FORMAT and bool(about.get("complete", True))
 
 
+_configuring = Lock()
+
+
+@contextmanager
+def _configured(how: Mapping[str, Any]) -> Iterator[None]:
+    """Let Zarr be configured so in this block, in one thread at a time: all threads have the same configuration."""
+    with _configuring, zarr.config.set(how):
+        yield
+
+
 @contextmanager
 def _opening(path: Path) -> Iterator[None]:
     """Turn what Zarr makes of metadata that it does not understand into a StoreError."""
@@ -223,6 +234,8 @@ def _opening(path: Path) -> Iterator[None]:
         yield
     except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError):
         raise
+    except OSError as error:
+        raise unreadable(path / METADATA, error) from error
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise damaged(path / METADATA, f"{type(error).__name__}: {error}") from error
 
@@ -263,7 +276,7 @@ def write_arrays(dataset: xr.Dataset, path: Path) -> None:
 
 def overwrite_array(path: Path, values: NDArray[Any]) -> None:
     """Write all values of an array of a store anew."""
-    with zarr.config.set(_WRITE_ALL):
+    with _configured(_WRITE_ALL):
         zarr.open_array(str(path), mode="r+", zarr_format=3)[...] = values
 
 
@@ -312,7 +325,7 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
     _check_nodes(path, about, about.get("arrays", ()))
     whole = format_of(about) >= FORMAT and not partial
     try:
-        with zarr.config.set(CHECKED if whole else {}), _opening(path):
+        with _configured(CHECKED if whole else {}), _opening(path):
             opened: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
         raise MissingStoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
