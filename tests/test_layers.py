@@ -89,11 +89,8 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    "journal": {"disk", "errors", "shard_files", "shards", "stores"},
-    "tries": {"errors"},
-    "deaths": set(),
-    "dispatch": {"deaths", "errors", "journal", "shards", "tries"},
-    "tasks": {"dispatch", "errors", "journal", "progress", "shards", "tries"},
+    | {"console", "editor", "hosting", "interrupts", "lazy", "options", "remote", "report", "simulate", "terminal"}
+    | {"verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 
