@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"journal", "provenance", "shards", "stores"}
+STORES = GROUND | {"damage", "disk", "journal", "provenance", "shards", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels", "pixel_range", "processor"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
 RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
@@ -23,18 +23,20 @@ ALLOWED = {
     "settings": {"errors"},
     "processor": {"kernels"},
     "provenance": {"processor", "settings"},
-    "stores": {"errors", "schema"},
+    "disk": set(),
+    "stores": {"damage", "disk", "errors", "schema", "shard_files"},
+    "damage": {"errors"},
     "shards": set(),
-    "journal": {"shards", "stores"},
+    "journal": {"disk", "errors", "shard_files", "shards", "stores"},
     "tasks": {"errors", "journal", "shards"},
     "kernels": set(),
     "io": STORES,
-    "shard_files": set(),
+    "shard_files": {"disk"},
     "layout": {"settings", "kernels", "shard_files"},
     "ome": {"schema", "stores"},
     "movie": STORES | {"kernels", "ome", "shard_files"},
     "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files", "tasks"},
-    "passes": STORES | {"movie", "tasks"},
+    "passes": STORES | {"movie", "shard_files", "tasks"},
     "lattice": {"kernels"},
     "seeds": GROUND,
     "windows": {"errors"},
@@ -42,13 +44,14 @@ ALLOWED = {
     "pixel_range": {"errors"},
     "filtering": MOVIE,
     "measure": MOVIE | {"filtering"},
-    "results": STORES | {"shard_files"},
+    "parts": STORES | {"shard_files", "tasks"},
+    "results": STORES | {"parts", "shard_files"},
     "plots": MOVIE | {"analysis", "lazy", "results", "seeds"},
     "drift": MOVIE | {"passes"},
     "summing": MOVIE | {"passes"},
     "detection": MOVIE | {"lattice", "passes", "seeds", "windows"},
     "columns": MOVIE | {"detection", "lattice", "seeds", "windows"},
-    "fit": MOVIE | {"measure", "results", "tasks", "vacuum", "windows"},
+    "fit": MOVIE | {"measure", "parts", "results", "tasks", "vacuum", "windows"},
     "comparison": MOVIE | {"filtering", "fit", "measure", "plots"},
     "dose": MOVIE | {"fit", "shard_files"},
     "analysis": MOVIE | {"columns", "measure", "results", "seeds", "vacuum", "windows"},
@@ -64,6 +67,7 @@ ALLOWED = {
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
+    "verify": STORES | {"conversion", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
     "pipeline": STAGES | {"cluster", "report", "stages"},
@@ -74,8 +78,8 @@ ALLOWED = {
     "console": {"options"},
     "certificates": {"errors"},
     "service": RUN
-    | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
-    | {"meter", "report", "supervision", "terminal", "web"},
+    | {"parts", "analysis", "certificates", "describe", "export", "forkserver", "lazy"}
+    | {"meter", "report", "shard_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},
@@ -83,7 +87,8 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "system", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
+    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "system", "terminal"}
+    | {"verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

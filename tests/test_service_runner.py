@@ -465,6 +465,7 @@ def test_a_process_ends_with_its_standard_input(whole, client, tmp_path):
         "output": str(tmp_path / "out"),
         "settings": SETTINGS,
         "cluster": {"scheduler": client.scheduler.address},
+        "credentials": None,
         "columns": None,
         "until": None,
         "stages": {},

@@ -205,6 +205,29 @@ def fit(
     _exit_for(summary.bad_frames)
 
 
+@main.command()
+@click.argument("path", type=PATH, metavar="OUTPUT")
+@click.option("--repair", is_flag=True, help="Then make what is damaged in a movie anew, from its source.")
+@common_options
+def verify(path: Path, *, repair: bool, as_json: bool) -> None:
+    """Read all that the run in the folder OUTPUT wrote, and name what is damaged or missing.
+
+    OUTPUT may also be a single store (.zarr). The exit code is 0 where all is sound, and 1 where it is not.
+    """
+    from . import verify as verifying
+
+    with _progress() as on_event:
+        found = verifying.verify(path, on_event)
+        if repair and verifying.repair(found, on_event):
+            found = verifying.verify(path, on_event)
+    if as_json:
+        click.echo(json.dumps(found.to_record()))
+    else:
+        click.echo(found.text())
+    if not found.sound:
+        click.get_current_context().exit(FAILED)
+
+
 @main.command("compare-filters")
 @click.argument("source")
 @click.argument("output", type=PATH)

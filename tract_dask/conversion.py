@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -21,19 +21,18 @@ import numpy as np
 import zarr
 from distributed import Client
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
 
-from . import schema, stores
+from . import disk, schema, stores
 from .errors import DestinationError, SourceError
 from .io import FrameSource, SourceMetadata, open_cached, open_source
-from .journal import Journal, Payload, journal_beside
+from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
 from .ome import AXES, describe
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import fingerprint, provenance, stage_key
-from .settings import ConvertSettings, MetadataSettings, SourceSettings
-from .shard_files import BLOSC, Grid, ShardWriter, shard_path
+from .settings import ConvertSettings, MetadataSettings, SourceSettings, from_toml, to_toml
+from .shard_files import CHUNK_KEYS, Grid, ShardWriter, chunk_path, codecs
 from .shards import Shard, split
 from .tasks import stream_shards
 
@@ -97,9 +96,11 @@ def convert(
 
     present = stores.attributes(path)
     same = present.get("kind") == "movie" and present.get("key") == key
+    if not present.get("complete"):
+        same &= stores.format_of(present) == stores.FORMAT  # shards of an older format do not go with ours
     if same and present.get("complete"):
         update_metadata(path, known)
-        stores.remove(journal_beside(path))
+        remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
         on_event(StageDone(STAGE, time.perf_counter() - started, reused=True, summary="already converted"))
         return path
@@ -111,9 +112,10 @@ def convert(
     with stores.disk_errors(path):
         if not same:
             _clear(path)
-            about = provenance(key, settings, movie.path) | {"format": movie.format}
+            about = provenance(key, settings, movie.path) | {"source_format": movie.format}
+            about["source_settings"] = to_toml(source_settings)
             _create(path, layout, settings.codec, about, known)
-        journal = Journal(journal_beside(path), key)
+        journal = Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
     on_event(announce(done_frames=journal.frames_done(shards)))
     statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
 
@@ -122,18 +124,69 @@ def convert(
             values[shard.start : shard.stop] = payload[name]
 
     stream_shards(
-        partial(_convert_shard, _Job(_absolute(movie.path), source_settings, path, layout, settings.codec)),
+        partial(
+            _convert_shard, _Job(_absolute(movie.path), source_settings, path, journal.path, layout, settings.codec)
+        ),
         shards,
         keep,
         journal=journal,
         name=STAGE,
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone(STAGE, shard.index, shard.frames)),
+        file=movie.path,
+        on_event=on_event,
     )
     _finalise(path, statistics, known)
     journal.remove()
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
     return path
+
+
+def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_event: Sink = silent) -> None:
+    """Make some shards of a complete movie anew from its source, in this process.
+
+    Parameters
+    ----------
+    shards
+        Their indices.
+    everything
+        Make all shards, and the statistics and coordinates too.
+
+    Raises
+    ------
+    SourceError
+        Where the source is not there, or is not what the movie was made from.
+    """
+    about = stores.attributes(path)
+    settings = from_toml(ConvertSettings, about["settings"], str(path))
+    declared = from_toml(SourceSettings, about["source_settings"], str(path))
+    source = open_source(about["source"], declared)
+    if movie_key(source, settings, declared) != about["key"]:
+        raise SourceError(
+            "the source is not what the movie was made from",
+            source.path,
+            "the same file",
+            "another one",
+            f"Remove {path}, and convert what you have",
+        )
+    layout = plan_layout(source.shape, source.dtype, settings)
+    chosen = [shard for shard in split(layout.shape[0], layout.frames_per_shard) if everything or shard.index in shards]
+    aside = path.with_name(f".{path.name}.repair")
+    stores.remove(aside)
+    aside.mkdir()
+    job = _Job(_absolute(source.path), declared, path, aside, layout, settings.codec)
+    frame_bytes = math.prod(layout.shape[1:]) * layout.dtype.itemsize
+    on_event(StageStarted(STAGE, sum(shard.frames for shard in chosen), frame_bytes=frame_bytes))
+    started = time.perf_counter()
+    statistics = {name: np.empty(layout.shape[0]) for name in schema.STATISTICS}
+    for shard in chosen:
+        for name, values in _convert_shard(job, shard).items():
+            statistics[name][shard.start : shard.stop] = values
+        on_event(ShardDone(STAGE, shard.index, shard.frames))
+    if everything:
+        _finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
+    stores.remove(aside)
+    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made anew"))
 
 
 def movie_key(
@@ -166,6 +219,7 @@ class _Job:
     source: str
     source_settings: SourceSettings
     path: Path
+    aside: Path
     layout: Layout
     codec: str
 
@@ -220,7 +274,8 @@ def _writer(job: _Job, factor: int, index: int) -> ShardWriter:
     """Return the writer of a shard of the frames (``factor`` 1) or of a binned level."""
     array = job.path / ("0" if factor == 1 else f"binned/{factor}")
     dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
-    return ShardWriter(shard_path(array, index), journal_beside(job.path), job.layout.grid(factor), dtype, job.codec)
+    place = chunk_path(array, index, 0, 0)
+    return ShardWriter(place, job.aside, job.layout.grid(factor), dtype, job.codec)
 
 
 def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
@@ -245,7 +300,7 @@ def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known
         "bins": layout.bins,
     }
     describe(aside, about | plan | _quantities(known))
-    aside.replace(path)
+    disk.place_folder(aside, path)
 
 
 def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> zarr.Array[Any]:
@@ -255,7 +310,8 @@ def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> z
         chunks=grid.chunk,
         shards=grid.shard,
         dtype=dtype,
-        compressors=BloscCodec(**BLOSC[codec]) if codec in BLOSC else None,
+        compressors=codecs(codec),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
         dimension_names=AXES,
         zarr_format=3,
@@ -268,6 +324,8 @@ def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: d
         shape=(length,),
         chunks=(length,),
         dtype=dtype,
+        compressors=codecs("zstd"),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
         dimension_names=(axis,),
         attributes=attributes,
@@ -279,7 +337,8 @@ def _finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sou
     """Write the statistics (frames,) and the metadata, and say that the store is complete."""
     with stores.disk_errors(path):
         for name, values in statistics.items():
-            zarr.open_array(str(path / name), mode="r+")[...] = values
+            stores.overwrite_array(path / name, values)
+        disk.sync_folders(path, tuple(statistics))
         describe(path, stores.attributes(path) | _quantities(known) | {"complete": True})
 
 
@@ -319,7 +378,7 @@ def _is_zarr(folder: Path) -> bool:
 
 def _clear(path: Path) -> None:
     """Remove a store and its journal; renamed first, so that what is at ``path`` is always whole."""
-    stores.remove(journal_beside(path))
+    remove_journal(journal_beside(path))
     aside = path.with_name(f".{path.name}.removed")
     stores.remove(aside)
     if path.exists():

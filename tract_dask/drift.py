@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from . import schema
 from .errors import SettingsError, SourceError
-from .journal import Payload
+from .journal import Fields, Payload
 from .kernels.alignment import Template, align
 from .kernels.magnitude import unit_of
 from .kernels.registration import (
@@ -43,7 +43,7 @@ from .kernels.registration import (
 )
 from .kernels.sums import Whole, add_shifted
 from .movie import Movie
-from .passes import Passes, save_array
+from .passes import Passes, load_saved, save_array
 from .processor import processor
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
@@ -68,7 +68,11 @@ SEARCH_SHARE = 0.4
 SEARCH_LOSS = 0.75
 """For the search it is binned by 2 and 2 again as long as that loses less than this share of the information."""
 
-PASSES = ("follow", "refine")
+PASSES: dict[str, Fields] = {
+    "follow": {"drift": (None, 2), "placed": (None, 2), "trusted": (None,)},
+    "refine": {"drift": (None, 2), "quality": (None,)},
+}
+"""The two runs over the movie, and what a shard's payload holds after each."""
 
 _BLOCK_BYTES = 16 << 20
 _SAMPLES, _SAMPLE_FRAMES = 4, 2
@@ -264,7 +268,7 @@ def _measure_drift(
     shards = _parts(movie)
     with Passes("drift", movie, on_event, folder, client, len(PASSES)) as stage:
         key = stage_key(movie.key, f"drift {settings.search_px!r}")
-        follow, refine = (stage.journal(name, f"{name} {key}") for name in PASSES)
+        follow, refine = (stage.journal(name, f"{name} {key}", fields) for name, fields in PASSES.items())
         stage.begin([(follow, shards), (refine, shards)])
         payloads = stage.run(partial(_follow_shard, movie, level, follow.path), shards, follow)
         track, places = _chain(level, shards, payloads, follow.path)
@@ -452,7 +456,7 @@ def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], 
             continue
         here = slice(shard.start, shard.stop)
         first, final = np.flatnonzero(trusted)[[0, -1]]
-        total, exposure = load_array(folder / f"{shard.index}.npy")
+        total, exposure = load_saved(folder / f"{shard.index}.npy")
         guess = last - drift[first] if track.trusted.any() else np.zeros(2)
         small = fold_image(total / np.float32(max(1.0, exposure.max())), level.search_fold)
         offset, _ = follower.follow(small, guess)
@@ -470,7 +474,7 @@ def _add_up(level: Level, places: Whole, folder: Path) -> Image:
     """Return the sum of all shards and how many frames cover each of its pixels, (2, y, x)."""
     total = np.zeros((2, *level.shape), np.float32)
     for index, place in enumerate(places):
-        add_shifted(total, load_array(folder / f"{index}.npy"), place)
+        add_shifted(total, load_saved(folder / f"{index}.npy"), place)
     return total
 
 
@@ -491,9 +495,9 @@ def _refine_shard(movie: Movie, level: Level, follow: Path, folder: Path, shard:
 
 def _mean_of_others(level: Level, follow: Path, folder: Path, shard: Shard) -> Template:
     """Return the mean of all shards but one; of all, where there is no other."""
-    every, place = load_array(folder / "sum.npy"), load_array(folder / "places.npy")[shard.index]
+    every, place = load_saved(folder / "sum.npy"), load_saved(folder / "places.npy")[shard.index]
     others = every.copy()
-    add_shifted(others, -load_array(follow / f"{shard.index}.npy"), place)
+    add_shifted(others, -load_saved(follow / f"{shard.index}.npy"), place)
     total, exposure = others if others[1].any() else every
     return Template(total, exposure, level.spectrum.frequency, level.spectrum.gain(max(1.0, float(exposure.max()))))
 

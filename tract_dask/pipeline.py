@@ -22,7 +22,7 @@ from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError
 from .fit import FitSummary
 from .io import FrameSource, open_source
-from .journal import journal_beside
+from .journal import journal_beside, remove_journal
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
 from .progress import (
@@ -595,8 +595,8 @@ def clear_run(outputs: Outputs) -> None:
     """Delete what a run writes, and nothing else."""
     stages = (outputs.movie, outputs.drift, outputs.sum, outputs.columns.with_suffix(".zarr"), outputs.results)
     for path in stages:
+        remove_journal(journal_beside(path))
         stores.remove(path)
-        stores.remove(journal_beside(path))
     files = (outputs.columns, outputs.columns.with_suffix(".png"), outputs.report, outputs.settings, outputs.events)
     for path in files:
         stores.remove(path)

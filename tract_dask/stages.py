@@ -23,7 +23,7 @@ from .conversion import convert, movie_key
 from .drift import estimate_drift
 from .errors import DestinationError
 from .io import FrameSource
-from .journal import journal_beside
+from .journal import journal_beside, remove_journal
 from .movie import Movie, open_movie
 from .pixel_range import check_pixels
 from .progress import Sink, StageDone, StageStarted, Warned, silent
@@ -210,7 +210,7 @@ def _kept(
             "Choose another place",
         )
     if _is_done(path, key):
-        stores.remove(journal_beside(path))  # of a run that was killed just before it had removed it
+        remove_journal(journal_beside(path))  # of a run that was killed just before it had removed it
         on_event(StageDone(stage, 0.0, reused=True))
         dataset = stores.open_dataset(path)
         if dataset.attrs.get("pixel_size_pm") == movie.pixel_size_pm:
@@ -220,7 +220,7 @@ def _kept(
         dataset = make(journal)
     dataset.attrs["pixel_size_pm"] = movie.pixel_size_pm
     _save(dataset, path, key, settings, stage, source=str(movie.path))
-    stores.remove(journal_beside(path))
+    remove_journal(journal_beside(path))
     return dataset
 
 

@@ -295,7 +295,7 @@ def measured(run: Survey) -> list[tuple[str, str]]:
     kinds = sorted({str(kind) for kind in run.columns["kind"].to_numpy()} - {""})
     rows = {
         "Movie": _source(run),
-        "Format": movie.get("format"),
+        "Format": movie.get("source_format"),
         "Frames": f"{shape[0]:,} of {shape[2]:,} × {shape[1]:,} px ({movie.get('dtype', 'dtype not known')})",
         "Size of a pixel": f"{known['pixel_size_pm']:g} pm" if run.unit == "pm" else "not known",
         "Field of view": f"{shape[2] * run.scale / 1000:.3g} × {shape[1] * run.scale / 1000:.3g} nm"
