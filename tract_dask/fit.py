@@ -189,8 +189,7 @@ def _fit_shards(
     movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink
 ) -> tuple[dict[str, int], set[str]]:
     """Fit the shards that are not on disk; return the counts of all, and the processors that took part."""
-    summary = dict.fromkeys(_COUNTS, 0)
-    processors: set[str] = set()
+    summary, processors = dict.fromkeys(_COUNTS, 0), set[str]()
 
     def add(shard: Shard, payload: Payload) -> None:
         for name in summary:

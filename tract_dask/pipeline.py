@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -20,7 +21,7 @@ from . import stores
 from .cluster import LazyClient, local_memory_limit, memory_budget
 from .conversion import check_kept, is_movie_of, remembered_source
 from .drift import read_drift_csv
-from .errors import ClusterError, DestinationError, InputError, SourceError
+from .errors import ClusterError, DestinationError, InputError, SourceError, StoreError
 from .fit import FitSummary
 from .io import FrameSource, open_source
 from .journal import journal_beside, remove_journal
@@ -476,6 +477,13 @@ class _Session:
         if kind is not None:
             self.state, self.message = "interrupted" if kind is KeyboardInterrupt else "failed", ""
         self.send(RunDone(self.state, perf_counter() - self._began, self.message))
+        if isinstance(error, OSError) and error.errno and not isinstance(error, ConnectionError | TimeoutError):
+            raise StoreError(
+                "a file could not be read or written",
+                error.filename or f"{self._started.output}, made from {self._started.source}",
+                got=os.strerror(error.errno),
+                remedy="Look at the disk, then run the same command again: what is done is kept",
+            ) from error
 
     def _on_connect(self, client: Client) -> None:
         if self._plan:
