@@ -60,7 +60,7 @@ class Search:
 
     found: list[Found] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
-    seen: set[tuple[str, int]] = field(default_factory=set)
+    seen: set[tuple[int, int]] = field(default_factory=set)
     looked: int = 0
 
 
@@ -185,7 +185,8 @@ def _look(search: Search, path: str, at: Callable[[], Any]) -> Any:
 
 def _is_new(item: Any, search: Search) -> bool:
     """Tell whether an object is met for the first time: hard links, too, may lead in a circle."""
-    key = (os.path.realpath(item.file.filename), h5py.h5o.get_info(item.id).addr)
+    information = h5py.h5o.get_info(item.id)
+    key = (information.fileno, information.addr)
     new = key not in search.seen
     search.seen.add(key)
     return new

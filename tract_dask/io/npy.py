@@ -13,7 +13,6 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings import SourceSettings
-from ..stores import sole_parser
 from .blocks import open_block
 from .source import Frames, Source, SourceMetadata, checked_dtype, checked_shape, truncated, widened
 
@@ -88,17 +87,25 @@ def _header(path: Path) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
         if length > _HEADER_BYTES:
             raise ValueError(f"a header of {length:,} bytes")
         text = file.read(length)
-        if found := _USUAL.fullmatch(text):
-            shape = tuple(int(part) for part in found[3].split(b",") if part.strip())
-            return shape, found[2] == b"True", np.dtype(found[1].decode()), file.tell()
-        file.seek(8)
-        with sole_parser():
-            read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-            shape, fortran, stored = read(file)
-        return shape, fortran, stored, file.tell()
+        return *_fields(text.decode("latin-1")), file.tell()
 
 
-_USUAL = re.compile(
-    rb"\{'descr': '([<>|=]?[a-z]\d+)', 'fortran_order': (True|False), 'shape': \(([\d, ]*)\),? *\} *\n?"
+_FIELD = re.compile(
+    r"""\s*(['"])(?:(descr)\1\s*:\s*(?:(['"])([<>|=]?[A-Za-z]\d*(?:\[\w+\])?)\3|\[[^\]]*\])"""
+    r"""|(fortran_order)\1\s*:\s*(True|False)|(shape)\1\s*:\s*\(([-\d\s,]*)\))\s*,?"""
 )
-"""A header as NumPy writes it, which is read without Python's parser and the lock that it takes."""
+"""One of the three fields, as a Python literal."""
+
+
+def _fields(text: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order and type from a header: by hand, for Python's own parser takes long, and a lock."""
+    body = text.strip()
+    fields, at = {}, 1
+    while found := _FIELD.match(body, at):
+        fields[found[2] or found[5] or found[7]] = found
+        at = found.end()
+    if set(fields) != {"descr", "fortran_order", "shape"} or body[:1] != "{" or body[at:].strip() != "}":
+        raise ValueError(text[:200])
+    shape = tuple(int(part) for part in fields["shape"][8].split(",") if part.strip())
+    stored = np.dtype(fields["descr"][4] or "V1")  # a list of fields is no type of pixels in any case
+    return shape, fields["fortran_order"][6] == "True", stored
