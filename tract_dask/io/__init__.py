@@ -5,7 +5,6 @@ A format is a function from a path to a :class:`~tract_dask.io.source.Source` an
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -15,6 +14,7 @@ from typing import TypeAlias
 from ..errors import SourceError
 from ..settings import MetadataSettings, SourceSettings
 from .hdf5 import open_hdf5
+from .listing import FileList, list_files
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
@@ -22,10 +22,23 @@ from .sequence import open_sequence
 from .source import FrameSource, Source, SourceMetadata, unreadable
 from .tiff import open_tiff
 
-__all__ = ["READERS", "FrameSource", "SourceMetadata", "open_cached", "open_source"]
+__all__ = [
+    "READERS",
+    "FileList",
+    "FrameSource",
+    "Permit",
+    "SourceMetadata",
+    "list_files",
+    "open_cached",
+    "open_source",
+    "unknown_format",
+]
 
 Opener: TypeAlias = Callable[[Path, str, SourceSettings], Source]
 """Takes a file, the path inside it (HDF5 only), and how to read it; makes every check."""
+
+Permit: TypeAlias = Callable[[Path], object]
+"""Takes the resolved path of a file that is about to be opened, and raises to refuse it."""
 
 READERS: dict[str, Opener] = {
     ".tif": open_tiff,
@@ -45,14 +58,15 @@ READERS: dict[str, Opener] = {
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
 
-_WILD = "*?["
 _VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
 
 
 def open_source(
-    path: str | Path,
+    path: str | Path | FileList,
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
 ) -> FrameSource:
     """Open a movie: a file, ``file.h5::/path/in/file``, a folder, or a glob of files that count up.
 
@@ -61,11 +75,14 @@ def open_source(
     Parameters
     ----------
     path
-        What to open. In a folder, all files of its one readable format.
+        What to open. Of a folder, all files of its one readable format. Only the last part may be a pattern, and a
+        path that exists is none. A list of files is opened as it is.
     settings
         Shape and type of raw files.
     metadata
         What the user knows better than the file.
+    permit
+        Called with the resolved path of every file before it is opened.
 
     Returns
     -------
@@ -81,7 +98,7 @@ def open_source(
     """
     name = str(path)
     try:
-        source = _open(name, settings)
+        source = _open(path, settings, permit)
     except OSError as error:
         raise unreadable(name, error) from error
     known = source.metadata
@@ -96,9 +113,11 @@ def open_source(
 
 
 def open_cached(
-    path: str | Path,
+    path: str | Path | FileList,
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
 ) -> FrameSource:
     """Open a movie as :func:`open_source` does, or return it as this process last opened it, unless it has changed.
 
@@ -108,50 +127,30 @@ def open_cached(
     place = Path(str(path).partition("::")[0])
     status = (place if place.exists() else place.parent).stat() if place.parent.exists() else None
     stamp = (status.st_size, status.st_mtime_ns) if status else None
-    return _open_stamped(str(path), settings, metadata, stamp)
+    return _open_stamped(path if isinstance(path, FileList) else str(path), settings, metadata, permit, stamp)
 
 
 @lru_cache(maxsize=4)
 def _open_stamped(
-    path: str, settings: SourceSettings, metadata: MetadataSettings, stamp: tuple[int, int] | None
+    path: str | FileList,
+    settings: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    stamp: tuple[int, int] | None,
 ) -> FrameSource:
-    return open_source(path, settings, metadata)
+    return open_source(path, settings, metadata, permit=permit)
 
 
-def _open(name: str, settings: SourceSettings) -> Source:
-    outer, _, inner = name.partition("::")
-    place = Path(outer)
-    open_file = partial(_open_file, inner=inner, settings=settings)
-    if place.is_dir():
-        return open_sequence(name, _readable(place), open_file)
-    if not place.exists() and any(sign in outer for sign in _WILD):
-        return open_sequence(name, _matching(place), open_file)
-    return open_file(place)
+def _open(path: str | Path | FileList, settings: SourceSettings, permit: Permit | None) -> Source:
+    outer, _, inner = str(path).partition("::")
+    open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
+    listed = path if isinstance(path, FileList) else list_files(path, READERS)
+    return open_file(Path(outer)) if listed is None else open_sequence(listed.name, list(listed.files), open_file)
 
 
-def _matching(pattern: Path) -> list[Path]:
-    """Return the files that a pattern with ``*``, ``?``, ``[]`` or ``**`` stands for."""
-    fixed = next(k for k, part in enumerate(pattern.parts) if any(sign in part for sign in _WILD))
-    found = Path(*pattern.parts[:fixed]).glob(str(Path(*pattern.parts[fixed:])))
-    return [file for file in found if file.is_file()]
-
-
-def _readable(folder: Path) -> list[Path]:
-    """Return the files of the one readable format in a folder."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in READERS and not file.name.startswith(".")]
-    kinds = Counter(file.suffix.lower() for file in files)
-    if len({READERS[kind] for kind in kinds}) > 1:
-        raise SourceError(
-            "the folder holds files of several formats",
-            str(folder),
-            "one format",
-            ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
-            f"Choose by a glob, for example {folder}/*{next(iter(kinds))}",
-        )
-    return files
-
-
-def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
+def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
+    if permit is not None:
+        permit(path.resolve())
     if not path.exists():
         raise SourceError(
             "there is no such file",
@@ -162,15 +161,7 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
     declared = settings.raw_shape is not None and settings.raw_dtype is not None
     opener = READERS.get(suffix, open_raw if declared else None)
     if opener is None:
-        raise SourceError(
-            f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
-            str(path),
-            f"a name that ends in one of {', '.join(READERS)}",
-            suffix or "a name without a suffix",
-            "Export the movie as TIFF or MRC"
-            if suffix in _VENDORS
-            else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
-        )
+        raise unknown_format(path)
     if inner and opener is not open_hdf5:
         raise SourceError(
             "only HDF5 files have paths inside",
@@ -180,3 +171,17 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
             f"Open {path}",
         )
     return opener(path, inner, settings)
+
+
+def unknown_format(path: Path) -> SourceError:
+    """Return the error for a file that no reader opens."""
+    suffix = path.suffix.lower()
+    return SourceError(
+        f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
+        str(path),
+        f"a name that ends in one of {', '.join(READERS)}",
+        suffix or "a name without a suffix",
+        "Export the movie as TIFF or MRC"
+        if suffix in _VENDORS
+        else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
+    )
