@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import fnmatch
+import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from ..errors import SourceError
+from .sequence import natural_key
 
 WILD = "*?["
 """Signs that make the last part of a path a pattern, unless there is a file or folder of this very name."""
@@ -22,9 +24,10 @@ class FileList:
     Attributes
     ----------
     name
-        The folder or the pattern that named them; with ``::`` and a path inside each file, where that was given.
+        The folder or the pattern that named them; with ``::`` and a path inside each file, where that was given. It
+        opens as the same files, unless they have changed meanwhile.
     files
-        Whole paths, in any order.
+        In the order of the numbers in their names.
     """
 
     name: str
@@ -34,15 +37,17 @@ class FileList:
         return self.name
 
 
-def list_files(path: str | Path, readers: Mapping[str, Any]) -> FileList | None:
-    """Return the files that a folder or a pattern names; None where the path is that of one file.
+def list_files(name: str, outer: Path, readers: Mapping[str, Any]) -> FileList | None:
+    """Return the files that a folder or a pattern names; None where ``outer`` is one file.
 
     A path that exists is never a pattern, and only its last part may be one: the folder is taken as it is written.
 
     Parameters
     ----------
-    path
-        As :func:`tract_dask.io.open_source` takes it.
+    name
+        As the list is to be called.
+    outer
+        The folder or the pattern.
     readers
         Readers by suffix: of a folder the files of its one readable format are taken.
 
@@ -51,29 +56,36 @@ def list_files(path: str | Path, readers: Mapping[str, Any]) -> FileList | None:
     SourceError
         Where the folder of a pattern is not there, or a folder holds files of several formats.
     """
-    outer = Path(str(path).partition("::")[0])
     if outer.is_dir():
-        return FileList(str(path), tuple(_readable(outer, readers)))
-    if outer.exists() or not any(sign in outer.name for sign in WILD):
+        found = _readable(outer, readers)
+    elif _is_pattern(outer):
+        found = _matching(outer)
+    else:
         return None
-    if not outer.parent.is_dir():
+    return FileList(name, tuple(sorted(found, key=lambda file: natural_key(file.name))))
+
+
+def _is_pattern(place: Path) -> bool:
+    """Tell whether a path that is not there is a pattern, which only its last part may be."""
+    if not any(sign in str(place) for sign in WILD) or os.path.lexists(place):
+        return False
+    folder = place.parent
+    if not folder.is_dir() and any(sign in str(folder) for sign in WILD):
         raise SourceError(
             "there is no such folder",
-            str(outer.parent),
-            "a folder that is there; only the last part of a path may be a pattern",
-            remedy="Check the path",
+            str(folder),
+            "a folder, and a pattern for the names in it only",
+            str(place),
+            "Name the folder without * ? or [",
         )
-    return FileList(str(path), tuple(matching(outer.parent, outer.name)))
+    return folder.is_dir()
 
 
-def matching(folder: Path, pattern: str) -> list[Path]:
-    """Return the files of a folder whose names fit a pattern of ``*``, ``?`` and ``[]``; hidden ones only by a dot."""
-    hidden = pattern.startswith(".")
-    return [
-        file
-        for file in folder.iterdir()
-        if fnmatchcase(file.name, pattern) and file.name.startswith(".") == hidden and file.is_file()
-    ]
+def _matching(pattern: Path) -> list[Path]:
+    """Return the files whose names fit a pattern of ``*``, ``?`` or ``[]``; hidden ones where it begins with a dot."""
+    with os.scandir(pattern.parent) as found:
+        names = [item.name for item in found if fnmatch.fnmatchcase(item.name, pattern.name) and not item.is_dir()]
+    return [pattern.parent / name for name in names if name.startswith(".") <= pattern.name.startswith(".")]
 
 
 def _readable(folder: Path, readers: Mapping[str, Any]) -> list[Path]:

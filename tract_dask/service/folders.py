@@ -194,19 +194,21 @@ class DataRoot:
         _check_text(outer)
         folder, _, name = outer.rpartition("/")
         if any(letter in name for letter in WILD) and not os.path.lexists(self.path / outer):
-            return self._listed(f"{self.resolve(folder)}/{name}{sign}{inner}")
+            return self._listed(self.resolve(folder) / name, f"{sign}{inner}")
         place = self.resolve(outer)
         if place.is_file():
             _check_format(place)
         elif place.suffix == ".zarr":
             self.check_links(place)
         else:
-            return self._listed(f"{place}{sign}{inner}")
+            return self._listed(place, f"{sign}{inner}")
+        if sign and os.path.lexists(f"{place}{sign}{inner}"):
+            raise _outside("the path inside the file is that of another file, too", relative)
         return f"{place}{sign}{inner}"
 
-    def _listed(self, name: str) -> FileList:
+    def _listed(self, outer: Path, inner: str) -> FileList:
         """Return the files that a folder or a pattern names; each is resolved and checked."""
-        found = list_files(name, READERS) or FileList(name, ())
+        found = list_files(f"{outer}{inner}", outer, READERS) or FileList(f"{outer}{inner}", ())
         for file in found.files:
             if file.is_symlink() or not file.is_file():  # any other lies where it seems to lie
                 self.permit(file)

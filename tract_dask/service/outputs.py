@@ -84,8 +84,8 @@ def checked_place(root: DataRoot, mark: Mark) -> Path:
         )
     if mark.named_by_id:
         return place
-    if any(sign in output for sign in WILD):
-        raise _refused("the name of this folder could be taken for a pattern", output, "a name without *, ? and [")
+    if any(sign in output for sign in (*WILD, "::")):
+        raise _refused("this name could be taken for a pattern", output, "a name without *, ?, [ and ::")
     if folded(output) in ((), folded(JOBS)):
         raise _refused("the data root is no folder for a job", output or "output", "a folder in it")
     if twin := _twin(root.path, PurePosixPath(output).parts):
