@@ -11,6 +11,7 @@ import json
 import os
 import secrets
 import shutil
+import unicodedata
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -86,6 +87,12 @@ def checked_place(root: DataRoot, mark: Mark) -> Path:
         return place
     if any(sign in output for sign in (*WILD, "::")):
         raise _refused("this name could be taken for a pattern", output, "a name without *, ?, [ and ::")
+    if any(map(_is_odd, PurePosixPath(output).parts)):
+        raise _refused(
+            "this name would hide the folder",
+            output,
+            'names that do not begin with ".", nor end with " " or ".", nor have signs that cannot be seen',
+        )
     if folded(output) in ((), folded(JOBS)):
         raise _refused("the data root is no folder for a job", output or "output", "a folder in it")
     if twin := _twin(root.path, PurePosixPath(output).parts):
@@ -193,6 +200,10 @@ def _holds_run(folder: Path) -> bool:
     outputs = Outputs(folder)
     signs = (folder / MARK, outputs.settings, outputs.events, folder / "zarr.json")
     return folder.suffix.lower() == ".zarr" or any(sign.exists() for sign in signs)
+
+
+def _is_odd(name: str) -> bool:
+    return name.startswith(".") or name.endswith((" ", ".")) or any(unicodedata.category(sign) == "Cf" for sign in name)
 
 
 def _twin(folder: Path, parts: tuple[str, ...]) -> str:
