@@ -23,7 +23,7 @@ from .conversion import check_kept, is_movie_of, remembered_source
 from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError, SourceError, StoreError
 from .fit import FitSummary
-from .io import FrameSource, open_source
+from .io import FileList, FrameSource, Permit, open_source
 from .journal import journal_beside, remove_journal
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
@@ -103,6 +103,11 @@ class Outputs:
     def events(self) -> Path:
         """What happened when."""
         return self.root / "events.jsonl"
+
+    def written(self) -> tuple[Path, ...]:
+        """Return everything that a run writes: its stores, beside which journals may lie, then its files."""
+        stages = (self.movie, self.drift, self.sum, self.columns.with_suffix(".zarr"), self.results)
+        return (*stages, self.columns, self.columns.with_suffix(".png"), self.report, self.settings, self.events)
 
     def paths(self) -> dict[str, str]:
         """Return the paths by name."""
@@ -204,7 +209,7 @@ def plan_run(
 
 
 def run(
-    source: str | Path,
+    source: str | Path | FileList,
     output: str | Path,
     settings: RunSettings | None = None,
     *,
@@ -215,6 +220,7 @@ def run(
     report: bool = True,
     until: str | None = None,
     patience_s: float = 0.0,
+    permit: Permit | None = None,
 ) -> RunOutcome:
     """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
 
@@ -246,6 +252,8 @@ def run(
         ``columns``, the table can be edited first.
     patience_s
         How long to wait for another run in the same folder to end, in s.
+    permit
+        Called with the resolved path of every file of the source before it is opened.
 
     Raises
     ------
@@ -259,7 +267,7 @@ def run(
     settings = _absolute(settings or RunSettings())
     outputs = Outputs(Path(output).absolute())
     _check_stage(until)
-    with closing(_open(source, settings, None if overwrite else outputs.movie)) as opened:
+    with closing(_open(source, settings, None if overwrite else outputs.movie, permit)) as opened:
         check_inputs(opened, settings)
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
@@ -518,16 +526,18 @@ def _get_ready() -> None:
     load_kernels()
 
 
-def _open(source: str | Path, settings: RunSettings, kept: Path | None) -> FrameSource:
+def _open(
+    source: str | Path | FileList, settings: RunSettings, kept: Path | None, permit: Permit | None = None
+) -> FrameSource:
     """Open the source by its whole path, which any worker can use.
 
     A source that is not there is taken from the complete movie at ``kept``, if it is that movie's.
     """
-    path = str(Path(source).absolute())
+    place = source if isinstance(source, FileList) else str(Path(source).absolute())
     try:
-        return open_source(path, settings.source)
+        return open_source(place, settings.source, permit=permit)
     except SourceError as error:
-        gone = None if kept is None else remembered_source(kept, path, error)
+        gone = None if kept is None else remembered_source(kept, str(place), error)
         if gone is None:
             raise
         return gone
