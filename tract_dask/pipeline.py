@@ -39,7 +39,7 @@ from .progress import (
     silent,
     tee,
 )
-from .seeds import read_columns_csv
+from .seeds import read_columns_csv, settings_lattices
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import split
 from .stages import columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
@@ -545,6 +545,8 @@ def check_inputs(source: FrameSource, settings: RunSettings) -> None:
 
         table = _required(settings.columns.csv, "--columns")
         check_inside(read_columns_csv(table), source.shape[1:], str(table))
+    if settings.columns.method == "lattice":
+        settings_lattices(settings.columns.lattices)
     if settings.fit.window_px is not None:
         check_window(settings.fit.window_px, source.shape[1:])
     local_memory_limit(settings.cluster)

@@ -21,9 +21,12 @@ from numpy.typing import NDArray
 
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
+from .small_files import read_small
 
 ATTRIBUTE = "tract_dask"
 """Name of the attribute under which every store keeps its provenance and its own metadata."""
+
+_METADATA_BYTES = 16 << 20
 
 
 @contextmanager
@@ -75,8 +78,10 @@ def open_array(path: Path) -> zarr.Array[Any]:
 def attributes(path: Path) -> dict[str, Any]:
     """Return what the store at ``path`` says of itself under :data:`ATTRIBUTE`; empty where there is no such store."""
     try:
-        metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        metadata = json.loads(read_small(path / "zarr.json", _METADATA_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    if not isinstance(metadata, dict) or not isinstance(metadata.get("attributes", {}), dict):
         return {}
     found = metadata.get("attributes", {}).get(ATTRIBUTE, {})
     return found if isinstance(found, dict) else {}

@@ -33,6 +33,7 @@ STARTUP_S = 10.0
 """What a run takes beside its stages, whatever the movie."""
 
 _PAST_JOBS = 5
+_TRIED_BYTES = 256 << 20
 _WHOLE = frozenset(STAGES)
 
 
@@ -110,13 +111,27 @@ async def check_job(
         Where it cannot be done: the movie, the settings or the folder cannot be used.
     """
     root: DataRoot = state.root
+    settings, place, whole, folder = await to_thread.run_sync(_resolved, root, source, values, output)
+    checked = await state.workshop.run(check_source, place, whole, folder, about=root.path / source)
+    return stored_settings(settings), root.relative(folder) if folder else "", checked
+
+
+def _resolved(
+    root: DataRoot, source: str, values: dict[str, Any], output: str
+) -> tuple[RunSettings, str, RunSettings, Path | None]:
+    """Return the settings of a job, where its movie is, its settings with whole paths, and its folder if it names one.
+
+    Raises
+    ------
+    SettingsError, OutsideError, MissingStoreError
+        Where a setting or a path cannot be used.
+    """
     settings = job_settings(values)
     place = root.source(source)
     folder = root.resolve(output, must_exist=False) if output else None
     if folder == root.path:
         raise SettingsError("the data root is no folder for a job", "output", remedy="Name a folder in it")
-    checked = await state.workshop.run(check_source, place, inside(root, settings), folder)
-    return stored_settings(settings), root.relative(folder) if folder else "", checked
+    return settings, place, inside(root, settings), folder
 
 
 async def plan_job(state: AppState, source: str, values: dict[str, Any], output: str = "") -> dict[str, Any]:
@@ -187,11 +202,16 @@ def _raw_bytes(shape: tuple[int, int, int], dtype: str) -> int:
 
 
 def check_source(place: str, settings: RunSettings, folder: Path | None) -> Checked:
-    """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the workshop."""
+    """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the workshop.
+
+    Its first frame is read as well, unless that is very large: some files crash their reader only then.
+    """
     with closing(open_source(place, settings.source, settings.metadata)) as source:
         check_inputs(source, settings)
         if folder is not None and folder.exists():
             check_output(Outputs(folder), source, overwrite=False)
+        if _raw_bytes((1, *source.shape[1:]), source.dtype.name) <= _TRIED_BYTES:
+            source.read(0, 1)
         return Checked(source.shape, source.dtype.name, plan_run(source.shape, source.dtype, settings))
 
 

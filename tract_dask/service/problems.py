@@ -16,6 +16,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Match
 
 from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
+from .data.crashes import CrashError, ExhaustedError
 from .folders import OutsideError
 from .jobs.store import ConflictError, UnknownJobError, UnknownVersionError
 from .pages import error_page
@@ -33,6 +34,8 @@ STATUS: dict[type[TractError], int] = {
     MissingStoreError: 404,
     ConflictError: 409,
     TooLargeError: 413,
+    CrashError: 422,
+    ExhaustedError: 422,
     TooManyError: 429,
     ClusterError: 503,
     InputError: 400,
@@ -67,7 +70,10 @@ ERRORS: dict[int | str, dict[str, Any]] = {
     404: {"model": ErrorBody, "description": "There is no such job, file, version or result."},
     409: {"model": ErrorBody, "description": "The job's state forbids it."},
     413: {"model": ErrorBody, "description": "The body is too large."},
-    422: {"model": ErrorBody, "description": "A field is missing or invalid."},
+    422: {
+        "model": ErrorBody,
+        "description": "A field is missing or invalid, or a file makes its reader crash.",
+    },
     500: {"model": ErrorBody, "description": "The service failed."},
     503: {"model": ErrorBody, "description": "The cluster does not answer."},
 }

@@ -16,9 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
+from ...seeds import MOST_SITES
 from ...settings import RunSettings, from_dict
 from ..data import curation
-from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, MOST_SITES, Scene
+from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, Scene
 from ..entrance.access import Identity, Role, identity, may_change
 from ..jobs.states import CURATABLE, State
 from ..jobs.store import Job, JobStore
@@ -255,7 +256,7 @@ OfJob = Annotated[Scene, Depends(scene_of_job)]
 @router.get("/jobs/{job_id}/columns", response_model=Versions, responses=errors(400, 404, 503))
 async def list_versions(job_id: JobId, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
     """List the versions of a job's columns."""
-    first = await request.app.state.workshop.run(curation.summary, scene)
+    first = await request.app.state.workshop.run(curation.summary, scene, about=scene.sum)
     return await run_in_threadpool(_versions, request.app.state.store, job_id, first, who)
 
 
@@ -264,7 +265,7 @@ async def read_version(job_id: JobId, version: VersionNumber, request: Request, 
     """Read a version of a job's columns."""
     store: JobStore = request.app.state.store
     table = await run_in_threadpool(store.columns, job_id, version) if version else None
-    return _json(await request.app.state.workshop.run(curation.version_json, scene, version, table))
+    return _json(await request.app.state.workshop.run(curation.version_json, scene, version, table, about=scene.sum))
 
 
 @router.post("/jobs/{job_id}/columns", status_code=201, response_model=Saved, responses=errors(400, 404, 503))
@@ -272,7 +273,7 @@ async def save_version(job_id: JobId, new: NewVersion, request: Request, scene: 
     """Keep columns as a new version of a job's."""
     store, workshop = request.app.state.store, request.app.state.workshop
     await run_in_threadpool(lambda: may_change(who, store.job(job_id)))
-    first = await workshop.run(curation.summary, scene)
+    first = await workshop.run(curation.summary, scene, about=scene.sum)
     known = await run_in_threadpool(_versions, store, job_id, first, who)
     table = await workshop.run(curation.checked_csv, scene, *_parts(new.columns), known["next_column_id"])
     note = new.note.strip()

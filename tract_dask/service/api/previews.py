@@ -114,7 +114,18 @@ async def frame_picture(
     """Show a part of a frame of a movie on disk, in any format, also of a converted one."""
     place, version = await run_in_threadpool(_movie, request, path)
     return await kept_answer(
-        request, "image/png", version, pictures.source_png, place, raw, gain, frame, seen, version, said=said
+        request,
+        "image/png",
+        version,
+        pictures.source_png,
+        place,
+        raw,
+        gain,
+        frame,
+        seen,
+        version,
+        about=_file(request, path),
+        said=said,
     )
 
 
@@ -129,7 +140,17 @@ async def frame_histogram(
     """Tell what values a frame has, as frame.png shows it with the same parameters."""
     place, version = await run_in_threadpool(_movie, request, path)
     return await kept_answer(
-        request, "application/json", version, pictures.source_levels, place, raw, gain, frame, seen, version
+        request,
+        "application/json",
+        version,
+        pictures.source_levels,
+        place,
+        raw,
+        gain,
+        frame,
+        seen,
+        version,
+        about=_file(request, path),
     )
 
 
@@ -138,24 +159,28 @@ async def job_frame_picture(
     job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0, said: Version = ""
 ) -> Response:
     """Show a part of a frame of a job's movie."""
-    about, version = await run_in_threadpool(_job_movie, request, job_id)
+    opened, version = await run_in_threadpool(_job_movie, request, job_id)
     return await kept_answer(
-        request, "image/png", version, pictures.source_png, *about, frame, seen, version, said=said
+        request, "image/png", version, pictures.source_png, *opened, frame, seen, version, about=opened[0], said=said
     )
 
 
 @router.get("/jobs/{job_id}/histogram", response_class=Response, responses=_LEVELS)
 async def job_frame_histogram(job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0) -> Response:
     """Tell what values a frame of a job's movie has, as its frame.png shows it with the same parameters."""
-    about, version = await run_in_threadpool(_job_movie, request, job_id)
-    return await kept_answer(request, "application/json", version, pictures.source_levels, *about, frame, seen, version)
+    opened, version = await run_in_threadpool(_job_movie, request, job_id)
+    return await kept_answer(
+        request, "application/json", version, pictures.source_levels, *opened, frame, seen, version, about=opened[0]
+    )
 
 
 @router.get("/jobs/{job_id}/sum.png", response_class=Response, responses=_PICTURE)
 async def sum_picture(job_id: JobId, request: Request, seen: Seen, said: Version = "") -> Response:
     """Show a part of a job's drift-corrected summed image, in counts of one frame."""
     folder, version = await run_in_threadpool(_sum, request, job_id)
-    return await kept_answer(request, "image/png", version, pictures.sum_png, folder, seen, version, said=said)
+    return await kept_answer(
+        request, "image/png", version, pictures.sum_png, folder, seen, version, about=folder, said=said
+    )
 
 
 @router.get(
@@ -166,13 +191,21 @@ async def sum_picture(job_id: JobId, request: Request, seen: Seen, said: Version
 async def sum_about(job_id: JobId, request: Request, seen: Seen) -> Response:
     """Tell the size of a job's summed image, and what values it has."""
     folder, version = await run_in_threadpool(_sum, request, job_id)
-    return await kept_answer(request, "application/json", version, pictures.sum_levels, folder, seen, version)
+    return await kept_answer(
+        request, "application/json", version, pictures.sum_levels, folder, seen, version, about=folder
+    )
 
 
 def folder_of(request: Request, job_id: str) -> Path:
     """Return the folder of a job's output."""
     state = request.app.state
     found: Path = state.root.resolve(state.store.job(job_id).output, must_exist=False)
+    return found
+
+
+def _file(request: Request, path: str) -> Path:
+    """Return the file that a path in a request names, to be named in errors."""
+    found: Path = request.app.state.root.path / path
     return found
 
 
