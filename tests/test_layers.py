@@ -19,6 +19,7 @@ ALLOWED = {
     "lazy": set(),
     "progress": set(),
     "small_files": set(),
+    "locks": {"errors", "small_files"},
     "schema": {"errors"},
     "settings": {"errors"},
     "provenance": {"settings"},
@@ -64,7 +65,7 @@ ALLOWED = {
     "stages": STAGES,
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
-    "pipeline": STAGES | {"cluster", "report", "stages"},
+    "pipeline": STAGES | {"cluster", "locks", "report", "stages"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "editor": RUN | {"service"},
@@ -72,7 +73,7 @@ ALLOWED = {
     "console": {"options"},
     "certificates": {"errors"},
     "service": RUN
-    | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
+    | {"analysis", "certificates", "describe", "export", "forkserver", "lazy", "locks"}
     | {"meter", "report", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},

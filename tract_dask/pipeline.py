@@ -24,6 +24,7 @@ from .fit import FitSummary
 from .io import FrameSource, open_source
 from .journal import journal_beside
 from .layout import peak_memory, plan_layout
+from .locks import sole_use
 from .movie import Movie, open_movie
 from .progress import (
     REPORT,
@@ -612,7 +613,7 @@ def sole_run(outputs: Outputs, patience_s: float = 0.0) -> Iterator[None]:
     DestinationError
         Where another run holds it.
     """
-    with stores.sole_use(outputs.root / ".lock", "another run works in this folder", patience_s):
+    with sole_use(outputs.root / ".lock", "another run works in this folder", patience_s):
         yield
 
 

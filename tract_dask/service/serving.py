@@ -14,9 +14,9 @@ from urllib.parse import urlsplit
 
 import uvicorn
 
-from .. import stores
 from ..certificates import EXPIRES_SOON_DAYS, SERVICE, SERVICE_KEY, check_certificates
 from ..errors import DestinationError, InputError
+from ..locks import sole_use
 from .config import LOOPBACK, ServiceConfig
 from .entrance.access import Access, Role, Token
 from .entrance.headers import host_name
@@ -55,7 +55,7 @@ def serve(config: ServiceConfig, say: Callable[[str], None]) -> None:
     config = replace(config, data_root=root)
     prepare_state(config)
     with (
-        stores.sole_use(config.state / LOCK, _TAKEN, patience_s=1.0),
+        sole_use(config.state / LOCK, _TAKEN, patience_s=1.0),
         closing(listen(config.host, config.port)) as listener,
     ):
         config = replace(config, port=listener.getsockname()[1])
