@@ -64,7 +64,7 @@ ALLOWED = {
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
     "web": set(),
-    "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
+    "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},
     "pipeline": STAGES | {"cluster", "locks", "report", "stages"},
     "describe": RUN,
     "demo": RUN | {"simulate"},

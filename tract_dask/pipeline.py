@@ -351,7 +351,7 @@ def _run(
 ) -> RunOutcome:
     """Run the stages in their order, and stop after ``until``."""
     record, made = _Record(), _Made()
-    send = tee((record, JsonLines(outputs.events), on_event))
+    send = tee((record, JsonLines(outputs.events, on_event), on_event))
     plan = plan_run(source.shape, source.dtype, settings)
     with _Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
         stores.write_aside(outputs.settings, _run_toml(settings, {}).encode())

@@ -595,8 +595,6 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
         raise SettingsError(
             "the value is of the wrong type", where, kind.__name__, shown(value), meta.get("description", "")
         )
-    if isinstance(value, float) and not math.isfinite(value):
-        raise SettingsError("the value is not finite", where, "a number", repr(value), meta["description"])
     if isinstance(value, tuple):
         _check_items(where, meta, annotation, value)
     if meta.get("choices") and value not in meta["choices"]:
@@ -626,6 +624,8 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
             shown(value),
             meta["description"],
         )
+    if isinstance(value, float) and not math.isfinite(value):
+        raise SettingsError("the value is not finite", where, "a number", repr(value), meta["description"])
 
 
 def _check_items(where: str, meta: Mapping[str, Any], annotation: Any, value: tuple[Any, ...]) -> None:
