@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sqlite3
 from collections.abc import Mapping, Sequence
 from http import HTTPMethod, HTTPStatus
 from typing import Any
@@ -18,7 +19,8 @@ from starlette.routing import Match
 from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
 from .data.crashes import CrashError, ExhaustedError
 from .folders import OutsideError
-from .jobs.store import ConflictError, UnknownJobError, UnknownVersionError
+from .jobs.store import ConflictError, JobStoreError, UnknownJobError, UnknownVersionError
+from .jobs.tables import store_error
 from .pages import error_page
 from .refusals import ForbiddenError, NoTokenError, TooLargeError, TooManyError
 
@@ -37,6 +39,7 @@ STATUS: dict[type[TractError], int] = {
     CrashError: 422,
     ExhaustedError: 422,
     TooManyError: 429,
+    JobStoreError: 503,
     ClusterError: 503,
     InputError: 400,
     StoreError: 500,
@@ -75,7 +78,7 @@ ERRORS: dict[int | str, dict[str, Any]] = {
         "description": "A field is missing or invalid, or a file makes its reader crash.",
     },
     500: {"model": ErrorBody, "description": "The service failed."},
-    503: {"model": ErrorBody, "description": "The cluster does not answer."},
+    503: {"model": ErrorBody, "description": "The cluster does not answer, or the job store cannot be used."},
 }
 """What every route of the API may answer with, for its OpenAPI document."""
 
@@ -98,6 +101,7 @@ def body(error: TractError, root: str = "") -> dict[str, dict[str, str]]:
 def install(app: FastAPI) -> None:
     """Let the application answer every error that a route may raise in one shape."""
     app.add_exception_handler(TractError, _tract_error)
+    app.add_exception_handler(sqlite3.Error, _store_fails)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http)
 
@@ -108,6 +112,11 @@ def _tract_error(request: Request, error: Exception) -> Response:
     if found.status_code >= HTTPStatus.INTERNAL_SERVER_ERROR:
         log.warning("%s %s: %s", request.method, request.url.path, error)
     return _as_asked(request, found)
+
+
+def _store_fails(request: Request, error: Exception) -> Response:
+    assert isinstance(error, sqlite3.Error)
+    return _tract_error(request, store_error(request.app.state.store.path, error))
 
 
 def _invalid(request: Request, error: Exception) -> Response:
@@ -148,6 +157,8 @@ def _as_asked(request: Request, found: JSONResponse) -> Response:
 
 def unexpected(request: Request, error: Exception) -> Response:
     """Return the response for what nobody foresaw; it tells nothing of it."""
+    if isinstance(error, sqlite3.Error):  # in what stands in front of the routes
+        return _store_fails(request, error)
     problem = TractError(
         "the service failed", f"{request.method} {request.url.path}", remedy="Try again; its log says why it failed"
     )
