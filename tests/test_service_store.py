@@ -451,7 +451,7 @@ def test_a_file_of_version_1_is_copied_and_brought_up_to_date(tmp_path):
             "ana",
             "m.tif",
             "jobs/0123456789",
-            '{"fit": {"window_px": 21}}',
+            '{"fit": {}}',
             0,
             "queued",
             "then",
