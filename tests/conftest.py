@@ -37,6 +37,14 @@ def _untraced(compile_):
 Dispatcher.compile = _untraced(Dispatcher.compile)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def state_home(tmp_path_factory):
+    """Services keep their tokens outside of their data root: here, and not in the home of who runs the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(scope="module")
 def chromium():
     """A browser: Debian's Chromium, without which these tests fail."""

@@ -1,9 +1,9 @@
 """A folder, or a service's state, for one process alone, also where the file system knows no locks.
 
 The kernel's lock (flock) ends with its process, however that ends. Some file systems have none (Lustre without its
-option, some of FUSE), and some lose it for a while. So a holder leaves a record beside the lock file as well: which
-process it is, and a sign of life (the record's time) every :data:`BEAT_S` seconds. A process that cannot have the
-kernel's lock goes by the records alone. A record holds as long as
+option, some of FUSE), some lose it for a while, and some have one for each machine. So a holder leaves a record beside
+the lock file as well: which process it is, and a sign of life (the record's time) every :data:`BEAT_S` seconds. Who
+cannot have the kernel's lock goes by the record alone. A record holds as long as
 
 - its process lives, where that can be seen: on the same machine, in the same container;
 - its signs of life come, where it cannot. A record that gave none for :data:`STALE_S` seconds is watched for three
@@ -33,10 +33,10 @@ from typing import TypeAlias
 from .errors import DestinationError
 from .small_files import read_small
 
-BEAT_S = 10.0
+BEAT_S = 5.0
 """Time between two signs of life."""
 
-STALE_S = 120.0
+STALE_S = 60.0
 """A holder on another machine that gives no sign of life for so long has died."""
 
 _LOOK_S = 0.1
@@ -56,9 +56,13 @@ def sole_use(lock: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
     DestinationError
         Saying ``what`` another process does, where it holds the lock and still does after ``patience_s``; also where
         the lock cannot be made, or another machine took it over because this process had stood still for too long.
+    FileNotFoundError
+        Where its folder is not there.
     """
     try:
         descriptor = os.open(lock, _OPEN, 0o666)
+    except FileNotFoundError:
+        raise
     except OSError as error:
         raise _no_lock(lock, error) from error
     with os.fdopen(descriptor, "r+b", buffering=0) as file:
@@ -82,13 +86,7 @@ def _wait(file: FileIO, lock: Path, what: str, patience_s: float) -> _Record:
         if kernel is not False and (record := _take(_beside(lock), bool(kernel), watches)):
             return record
         if monotonic() >= deadline and not any(watch.may_end_soon for watch in watches.values()):
-            holder = _read(_beside(lock))
-            raise DestinationError(
-                what,
-                str(lock.parent),
-                got=f"process {holder.pid} on {holder.host}" if holder else "",
-                remedy="Wait for it, stop it, or choose another place",
-            )
+            raise _held(lock, what)
         _unlock(file, kernel)
         sleep(_LOOK_S)
 
@@ -130,8 +128,6 @@ class _Record:
         Where ``pid`` means this process: the running system, and the container.
     started
         When the process began, as the system counts; "" where that is not known.
-    kernel
-        Whether it has the kernel's lock as well.
     """
 
     token: str
@@ -139,12 +135,10 @@ class _Record:
     place: str
     pid: int
     started: str
-    kernel: bool
 
-    def is_dead(self, *, have_kernel: bool) -> bool | None:
-        """Tell whether its process has ended; None where that cannot be seen."""
-        if self.kernel and have_kernel:  # it has lost what we have now
-            return True
+    @property
+    def is_dead(self) -> bool | None:
+        """Whether its process has ended; None where that cannot be seen."""
         if self.place != _place():
             return None
         return not _runs(self.pid) or _started(self.pid) not in ("", self.started)
@@ -174,42 +168,38 @@ _Watches: TypeAlias = defaultdict[Path, _Watch]
 
 def _take(beside: Path, kernel: bool, watches: _Watches) -> _Record | None:
     """Leave a record if there is none that holds; None where there is."""
-    own = _Record(uuid.uuid4().hex, platform.node(), _place(), os.getpid(), _started(os.getpid()), kernel)
+    own = _Record(uuid.uuid4().hex, platform.node(), _place(), os.getpid(), _started(os.getpid()))
     try:
         if _write_new(beside, own):
             return own
-        if _holds(beside, kernel, watches[beside]):
-            return None
-        return own if _take_over(beside, own, watches) else None
+        return own if not _holds(beside, watches[beside]) and _take_over(beside, own, watches) else None
     except OSError as error:
         if kernel:  # a full disk, say; the kernel's lock is enough
             return own
         raise _no_lock(beside, error) from error
 
 
-def _holds(beside: Path, kernel: bool, watch: _Watch) -> bool:
+def _holds(beside: Path, watch: _Watch) -> bool:
     found = _read(beside)
     if found is None:  # it is being written, or was by a process that died of it
         return beside.exists() and not watch.is_stale("", beside)
-    dead = found.is_dead(have_kernel=kernel)
-    return not (watch.is_stale(found.token, beside) if dead is None else dead)
+    return not (watch.is_stale(found.token, beside) if found.is_dead is None else found.is_dead)
 
 
 def _take_over(beside: Path, own: _Record, watches: _Watches) -> bool:
     """Put a record in the place of one that holds no more; of several processes that try, one succeeds."""
-    guard = beside.with_name(f"{beside.name}.guard")
+    guard = _guard(beside)
     if not _write_new(guard, own):
-        if not _holds(guard, False, watches[guard]):
+        if not _holds(guard, watches[guard]):
             guard.unlink(missing_ok=True)  # its maker has died; one of those who try now makes another
         return False
     try:
-        if _holds(beside, own.kernel, watches[beside]):
+        if _holds(beside, watches[beside]):
             return False
         beside.unlink(missing_ok=True)
         if not _write_new(beside, own):
             return False
-        if not own.kernel:
-            sleep(_SETTLE_S)
+        sleep(_SETTLE_S)  # one that had found the old record, too, would put its own here now
         found = _read(beside)
         return found is not None and found.token == own.token
     finally:
@@ -261,7 +251,7 @@ class _Beat:
     def _go(self) -> None:
         while not self._ending.wait(BEAT_S):
             found = _read(self._beside)
-            if found is not None and found.token != self._record.token and not self._record.kernel:
+            if found is not None and found.token != self._record.token:
                 self.lost = True
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
                 return
@@ -273,6 +263,15 @@ class _Beat:
         self._ending.set()
         self._thread.join(_END_S)  # it may wait for a dead disk
         _remove(self._beside, self._record)
+
+
+def lock_files(lock: Path) -> tuple[Path, ...]:
+    """Return the files of a lock, for who deletes the folder that it holds."""
+    return lock, _beside(lock), _guard(_beside(lock))
+
+
+def _guard(beside: Path) -> Path:
+    return beside.with_name(f"{beside.name}.guard")
 
 
 def _beside(lock: Path) -> Path:
@@ -308,6 +307,18 @@ def _started(pid: int) -> str:
     except (OSError, ValueError):
         return ""
     return "ended" if state in ("Z", "X") else started
+
+
+def _held(lock: Path, what: str) -> DestinationError:
+    holder = _read(_beside(lock))
+    is_far = holder is not None and holder.is_dead is None
+    return DestinationError(
+        what,
+        str(lock.parent),
+        got=f"process {holder.pid} on {holder.host}" if holder else "",
+        remedy="Wait for it, stop it, or choose another place"
+        + (f"; one that was killed there counts as ended after {STALE_S:g} s" if is_far else ""),
+    )
 
 
 def _no_lock(lock: Path, error: OSError) -> DestinationError:

@@ -21,7 +21,7 @@ from .cluster import LazyClient, local_memory_limit, memory_budget
 from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError
 from .fit import FitSummary
-from .io import FrameSource, open_source
+from .io import FileList, FrameSource, Permit, open_source
 from .journal import journal_beside
 from .layout import peak_memory, plan_layout
 from .locks import sole_use
@@ -101,6 +101,11 @@ class Outputs:
     def events(self) -> Path:
         """What happened when."""
         return self.root / "events.jsonl"
+
+    def written(self) -> tuple[Path, ...]:
+        """Return everything that a run writes: its stores, beside which journals may lie, then its files."""
+        stages = (self.movie, self.drift, self.sum, self.columns.with_suffix(".zarr"), self.results)
+        return (*stages, self.columns, self.columns.with_suffix(".png"), self.report, self.settings, self.events)
 
     def paths(self) -> dict[str, str]:
         """Return the paths by name."""
@@ -202,7 +207,7 @@ def plan_run(
 
 
 def run(
-    source: str | Path,
+    source: str | Path | FileList,
     output: str | Path,
     settings: RunSettings | None = None,
     *,
@@ -213,6 +218,7 @@ def run(
     report: bool = True,
     until: str | None = None,
     patience_s: float = 0.0,
+    permit: Permit | None = None,
 ) -> RunOutcome:
     """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
 
@@ -240,6 +246,8 @@ def run(
         ``columns``, the table can be edited first.
     patience_s
         How long to wait for another run in the same folder to end, in s.
+    permit
+        Called with the resolved path of every file of the source before it is opened.
 
     Raises
     ------
@@ -253,7 +261,7 @@ def run(
     settings = _absolute(settings or RunSettings())
     outputs = Outputs(Path(output).absolute())
     _check_stage(until)
-    with closing(_open(source, settings)) as opened:
+    with closing(_open(source, settings, permit)) as opened:
         check_inputs(opened, settings)
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
@@ -501,9 +509,10 @@ def _get_ready() -> None:
     load_kernels()
 
 
-def _open(source: str | Path, settings: RunSettings) -> FrameSource:
+def _open(source: str | Path | FileList, settings: RunSettings, permit: Permit | None = None) -> FrameSource:
     """Open the source by its whole path, which any worker can use."""
-    return open_source(str(Path(source).absolute()), settings.source, settings.metadata)
+    place = source if isinstance(source, FileList) else str(Path(source).absolute())
+    return open_source(place, settings.source, settings.metadata, permit=permit)
 
 
 def sum_beside(path: Path) -> Path:
@@ -595,13 +604,9 @@ def check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> N
 
 def clear_run(outputs: Outputs) -> None:
     """Delete what a run writes, and nothing else."""
-    stages = (outputs.movie, outputs.drift, outputs.sum, outputs.columns.with_suffix(".zarr"), outputs.results)
-    for path in stages:
+    for path in outputs.written():
         stores.remove(path)
         stores.remove(journal_beside(path))
-    files = (outputs.columns, outputs.columns.with_suffix(".png"), outputs.report, outputs.settings, outputs.events)
-    for path in files:
-        stores.remove(path)
 
 
 @contextmanager

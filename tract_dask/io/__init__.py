@@ -5,8 +5,9 @@ A format is a function from a path to a :class:`~tract_dask.io.source.Source` an
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
+import os
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -15,14 +16,25 @@ from typing import TypeAlias
 from ..errors import SourceError
 from ..settings import MetadataSettings, SourceSettings
 from .hdf5 import open_hdf5
+from .listing import FileList, list_files
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
 from .sequence import open_sequence
-from .source import FrameSource, Source, SourceMetadata, unreadable
+from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
 
-__all__ = ["READERS", "FrameSource", "SourceMetadata", "open_cached", "open_source"]
+__all__ = [
+    "READERS",
+    "FileList",
+    "FrameSource",
+    "Permit",
+    "SourceMetadata",
+    "list_files",
+    "open_cached",
+    "open_source",
+    "unknown_format",
+]
 
 Opener: TypeAlias = Callable[[Path, str, SourceSettings], Source]
 """Takes a file, the path inside it (HDF5 only), and how to read it; makes every check."""
@@ -45,27 +57,32 @@ READERS: dict[str, Opener] = {
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
 
-_WILD = "*?["
 _VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
 
 
 def open_source(
-    path: str | Path,
+    path: Path | str | FileList | Sequence[Path | str],
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
 ) -> FrameSource:
-    """Open a movie: a file, ``file.h5::/path/in/file``, a folder, or a glob of files that count up.
+    """Open a movie: a file, ``file.h5::/path/in/file``, a folder, a pattern for the files of one folder, or a list.
 
     Everything that can be wrong with it is found here, before any work.
 
     Parameters
     ----------
     path
-        What to open. In a folder, all files of its one readable format.
+        What to open. In a folder, all files of its one readable format; of several files, the frames in their order.
+        A path that is there is never taken for a pattern. A :class:`FileList` is opened as it is.
     settings
         Shape and type of raw files.
     metadata
         What the user knows better than the file.
+    permit
+        Called with the resolved path of every file before it is opened, also of those that links inside of HDF5 files
+        lead to; raises to refuse it. It is asked again where the files of a sequence are opened to be read.
 
     Returns
     -------
@@ -79,11 +96,10 @@ def open_source(
     SettingsError
         Where a raw file is not, or wrongly, declared.
     """
-    name = str(path)
-    try:
-        source = _open(name, settings)
-    except OSError as error:
-        raise unreadable(name, error) from error
+    place = path if isinstance(path, FileList) else str(path) if isinstance(path, str | Path) else list(map(str, path))
+    name = next(iter(place), "") if isinstance(place, list) else str(place)
+    with reading(name):
+        source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
     known = source.metadata
     merged = SourceMetadata(
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
@@ -96,81 +112,71 @@ def open_source(
 
 
 def open_cached(
-    path: str | Path,
+    path: str | Path | FileList | tuple[str | Path, ...],
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
 ) -> FrameSource:
     """Open a movie as :func:`open_source` does, or return it as this process last opened it, unless it has changed.
 
     For tasks, each of which opens the movie anew: to walk along 10,000 pages takes a while, to ask for a file's time
     does not.
     """
-    place = Path(str(path).partition("::")[0])
-    status = (place if place.exists() else place.parent).stat() if place.parent.exists() else None
+    first = path[0] if isinstance(path, tuple) and path else path
+    place = Path(_split(str(first))[0])
+    status = next((at.stat() for at in (place, place.parent) if at.exists()), None)
     stamp = (status.st_size, status.st_mtime_ns) if status else None
-    return _open_stamped(str(path), settings, metadata, stamp)
+    return _open_stamped(path if isinstance(path, tuple | FileList) else str(path), settings, metadata, permit, stamp)
 
 
 @lru_cache(maxsize=4)
 def _open_stamped(
-    path: str, settings: SourceSettings, metadata: MetadataSettings, stamp: tuple[int, int] | None
+    path: str | FileList | tuple[str | Path, ...],
+    settings: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    stamp: tuple[int, int] | None,
 ) -> FrameSource:
-    return open_source(path, settings, metadata)
+    return open_source(path, settings, metadata, permit=permit)
 
 
-def _open(name: str, settings: SourceSettings) -> Source:
-    outer, _, inner = name.partition("::")
-    place = Path(outer)
-    open_file = partial(_open_file, inner=inner, settings=settings)
-    if place.is_dir():
-        return open_sequence(name, _readable(place), open_file)
-    if not place.exists() and any(sign in outer for sign in _WILD):
-        return open_sequence(name, _matching(place), open_file)
-    return open_file(place)
+def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None) -> Source:
+    name = str(path)
+    outer, inner = _split(name)
+    open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
+    listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
+    return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
 
 
-def _matching(pattern: Path) -> list[Path]:
-    """Return the files that a pattern with ``*``, ``?``, ``[]`` or ``**`` stands for."""
-    fixed = next(k for k, part in enumerate(pattern.parts) if any(sign in part for sign in _WILD))
-    found = Path(*pattern.parts[:fixed]).glob(str(Path(*pattern.parts[fixed:])))
-    return [file for file in found if file.is_file()]
-
-
-def _readable(folder: Path) -> list[Path]:
-    """Return the files of the one readable format in a folder."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in READERS and not file.name.startswith(".")]
-    kinds = Counter(file.suffix.lower() for file in files)
-    if len({READERS[kind] for kind in kinds}) > 1:
+def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> Source:
+    """Open files as one movie in the order of the list; all have the same path inside."""
+    split = [_split(name) for name in names]
+    inside = {inner for _, inner in split}
+    if len(inside) > 1:
         raise SourceError(
-            "the folder holds files of several formats",
-            str(folder),
-            "one format",
-            ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
-            f"Choose by a glob, for example {folder}/*{next(iter(kinds))}",
+            "the files of a list have different paths inside", names[0], "one path", ", ".join(sorted(inside)[:9])
         )
-    return files
+    open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
+    return open_sequence(names[0] if names else "an empty list", [Path(outer) for outer, _ in split], open_file)
 
 
-def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
-    if not path.exists():
-        raise SourceError(
-            "there is no such file",
-            str(path),
-            remedy="Check the path; on a cluster every worker must see it under the same name",
-        )
+def _split(name: str) -> tuple[str, str]:
+    """Return the path of a file, and the path inside it after two colons; a file whose name has colons is that file."""
+    places = [match.start() for match in re.finditer("::", name)]
+    for place in (len(name), *reversed(places)):
+        if os.path.lexists(name[:place]):
+            return name[:place], name[place + 2 :]
+    return name.partition("::")[0], name.partition("::")[2]
+
+
+def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
+    checked_file(path, permit)
     suffix = path.suffix.lower()
     declared = settings.raw_shape is not None and settings.raw_dtype is not None
     opener = READERS.get(suffix, open_raw if declared else None)
     if opener is None:
-        raise SourceError(
-            f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
-            str(path),
-            f"a name that ends in one of {', '.join(READERS)}",
-            suffix or "a name without a suffix",
-            "Export the movie as TIFF or MRC"
-            if suffix in _VENDORS
-            else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
-        )
+        raise unknown_format(path)
     if inner and opener is not open_hdf5:
         raise SourceError(
             "only HDF5 files have paths inside",
@@ -179,4 +185,19 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings) -> Source:
             f"the path {inner}",
             f"Open {path}",
         )
-    return opener(path, inner, settings)
+    with reading(str(path)):
+        return open_hdf5(path, inner, settings, permit=permit) if opener is open_hdf5 else opener(path, inner, settings)
+
+
+def unknown_format(path: Path) -> SourceError:
+    """Return the error for a file that no reader opens."""
+    suffix = path.suffix.lower()
+    return SourceError(
+        f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
+        str(path),
+        f"a name that ends in one of {', '.join(READERS)}",
+        suffix or "a name without a suffix",
+        "Export the movie as TIFF or MRC"
+        if suffix in _VENDORS
+        else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
+    )

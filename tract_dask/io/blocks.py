@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .source import NOTHING_KNOWN, Frames, Source, SourceMetadata, checked_dtype, checked_shape, truncated, unreadable
+from .source import (
+    NOTHING_KNOWN,
+    Frames,
+    Source,
+    SourceMetadata,
+    checked_dtype,
+    checked_shape,
+    reading,
+    truncated,
+    widened,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,26 +43,35 @@ class BlockSource(Source):
         """Whether frames that are read one by one take no longer than many at once."""
         return True
 
-    def read(self, start: int, stop: int) -> Frames:
-        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
-        frames = np.empty((len(self.offsets[start:stop]), *self.shape[1:]), self.dtype)
-        self.read_into(start, frames)
+    def _read(self, start: int, stop: int) -> Frames:
+        frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
+        self._fill(start, frames)
         return frames
 
     def read_into(self, start: int, frames: Frames) -> None:
         """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
+        with reading(self.path, f"the file cannot be read at frames {start} to {start + len(frames) - 1}"):
+            self._fill(start, frames)
+
+    def _fill(self, start: int, frames: Frames) -> None:
+        if self.stored.newbyteorder("=") == self.dtype:
+            self._fill_as_stored(start, frames)
+            if self.stored != self.dtype:
+                frames.byteswap(inplace=True)
+            return
+        as_stored = np.empty((1, *self.shape[1:]), self.stored)
+        for k in range(len(frames)):
+            self._fill_as_stored(start + k, as_stored)
+            frames[k : k + 1] = widened(as_stored, self.dtype)
+
+    def _fill_as_stored(self, start: int, frames: Frames) -> None:
         if not len(frames):
             return
         offsets = self.offsets[start : start + len(frames)]
         breaks = np.flatnonzero(np.diff(offsets) != frames[0].nbytes) + 1
-        try:
-            with self.files[0].open("rb", buffering=0) as file:
-                for first, last in pairwise((0, *breaks.tolist(), len(offsets))):
-                    _read_into(file, int(offsets[first]), frames[first:last], self.files[0])
-        except OSError as error:
-            raise unreadable(self.path, error) from error
-        if self.stored != self.dtype:
-            frames.byteswap(inplace=True)
+        with self.files[0].open("rb", buffering=0) as file:
+            for first, last in pairwise((0, *breaks.tolist(), len(offsets))):
+                fill_from(file, int(offsets[first]), frames[first:last], self.files[0])
 
 
 def open_block(
@@ -90,7 +109,7 @@ def open_block(
     )
 
 
-def _read_into(file: Any, offset: int, frames: Frames, path: Path) -> None:
+def fill_from(file: Any, offset: int, frames: Frames, path: Path) -> None:
     """Fill ``frames`` from ``offset`` on; one call of the system reads at most 2 GB."""
     target = frames.reshape(-1).view(np.uint8)
     file.seek(offset)

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import SourceError
 from .source import Frames, Source
@@ -16,31 +18,41 @@ from .source import Frames, Source
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SequenceSource(Source):
-    """Files read one after the other; ``firsts`` holds each file's first frame and, last, the number of frames."""
+    """Files read one after the other.
 
-    firsts: tuple[int, ...]
+    Attributes
+    ----------
+    parts
+        The files in order; ``files`` also holds those behind them.
+    firsts
+        Each file's first frame and, last, the number of frames.
+    open_file
+        Opens one of them.
+    """
+
+    parts: tuple[Path, ...]
+    firsts: NDArray[np.int64]
     open_file: Callable[[Path], Source]
 
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
-        return len(self.files) == self.shape[0]
+        return len(self.parts) == self.shape[0]
 
-    def read(self, start: int, stop: int) -> Frames:
-        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
-        start, stop, _ = slice(start, stop).indices(self.shape[0])
+    def _read(self, start: int, stop: int) -> Frames:
         frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
         number = int(np.searchsorted(self.firsts, start, side="right")) - 1
         while start < stop:
-            first, until = self.firsts[number], min(stop, self.firsts[number + 1])
-            part = self.open_file(self.files[number]).read(start - first, until - first)
-            frames[start - stop + len(frames) : until - stop + len(frames)] = part
+            first, until = int(self.firsts[number]), min(stop, int(self.firsts[number + 1]))
+            source = self.open_file(self.parts[number])
+            _check_alike(source, self.shape, self.dtype, str(self.parts[0]))
+            frames[start - stop + len(frames) : until - stop + len(frames)] = source.read(start - first, until - first)
             start, number = until, number + 1
         return frames
 
 
 def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Source]) -> SequenceSource:
-    """Open files as one movie; ``open_file`` opens one of them. A gap in their numbers becomes a note.
+    """Open files as one movie, in their order; ``open_file`` opens one of them. A gap in their numbers becomes a note.
 
     Raises
     ------
@@ -51,29 +63,37 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
         raise SourceError(
             "the movie has no frames", path, "at least one file to read", "none", "Check the folder or the pattern"
         )
-    files = sorted(files, key=lambda file: natural_key(file.name))
-    parts = [open_file(file) for file in files]
-    for part in parts:
-        if part.shape[1:] != parts[0].shape[1:] or part.dtype != parts[0].dtype:
-            raise SourceError(
-                "this file of the sequence differs from the first",
-                part.path,
-                f"{parts[0].shape[1]} x {parts[0].shape[2]} {parts[0].dtype}, as in {files[0].name}",
-                f"{part.shape[1]} x {part.shape[2]} {part.dtype}",
-                "Take it out of the folder, or choose the frames by a glob",
-            )
-    firsts = (0, *np.cumsum([part.shape[0] for part in parts]).tolist())
-    metadata = parts[0].metadata
+    first = open_file(files[0])
+    lengths, behind = [first.shape[0]], dict.fromkeys(first.files)
+    for file in files[1:]:
+        part = open_file(file)
+        _check_alike(part, first.shape, first.dtype, files[0].name)
+        lengths.append(part.shape[0])
+        behind.update(dict.fromkeys(part.files))
+    firsts = np.cumsum([0, *lengths])
+    metadata = first.metadata
     return SequenceSource(
         path=path,
-        files=tuple(files),
-        format=f"sequence of {parts[0].format}",
-        shape=(firsts[-1], *parts[0].shape[1:]),
-        dtype=parts[0].dtype,
+        files=tuple(behind),
+        format=f"sequence of {first.format}",
+        shape=(int(firsts[-1]), *first.shape[1:]),
+        dtype=first.dtype,
         metadata=replace(metadata, notes=metadata.notes + gaps([file.name for file in files])),
+        parts=tuple(files),
         firsts=firsts,
         open_file=open_file,
     )
+
+
+def _check_alike(part: Source, shape: tuple[int, int, int], dtype: np.dtype[Any], first: str) -> None:
+    if part.shape[1:] != shape[1:] or part.dtype != dtype:
+        raise SourceError(
+            "this file of the sequence differs from the first",
+            part.path,
+            f"{shape[1]} x {shape[2]} {dtype}, as in {first}",
+            f"{part.shape[1]} x {part.shape[2]} {part.dtype}",
+            "Take it out of the folder, or choose the frames by a glob",
+        )
 
 
 def natural_key(name: str) -> tuple[tuple[int, str], ...]:

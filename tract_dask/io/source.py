@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -9,10 +14,13 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError
+from ..errors import SourceError, TractError
 
 Frames: TypeAlias = NDArray[Any]
 """An array (frames, y, x)."""
+
+Permit: TypeAlias = Callable[[Path], object]
+"""Called with the resolved path of every file before it is opened; raises to refuse it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ class FrameSource(Protocol):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that hold the frames, in order."""
+        """All files that the frames come from, in order: also those behind the links of an HDF5 file."""
 
     @property
     def format(self) -> str:
@@ -105,27 +113,57 @@ class Source:
         return False
 
     def read(self, start: int, stop: int) -> Frames:
-        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
-        raise NotImplementedError
+        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x).
+
+        Raises
+        ------
+        SourceError
+            For whatever is wrong with the file.
+        """
+        start, stop, _ = slice(start, stop).indices(self.shape[0])
+        with reading(self.path, f"the file cannot be read at frames {start} to {stop - 1}"):
+            frames = self._read(start, stop)
+        expected = (max(0, stop - start), *self.shape[1:])
+        if frames.shape != expected:
+            raise SourceError(
+                "the file has changed since it was opened",
+                self.path,
+                f"{expected[0]} frames from frame {start} on, each {expected[1]} x {expected[2]}",
+                " x ".join(map(str, frames.shape)),
+                "Wait until it has been written, then begin again",
+            )
+        return frames
 
     def read_into(self, start: int, frames: Frames) -> None:
-        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
+        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on.
+
+        Raises
+        ------
+        SourceError
+            For whatever is wrong with the file.
+        """
         frames[...] = self.read(start, start + len(frames))
+
+    def _read(self, start: int, stop: int) -> Frames:
+        """Return frames as :meth:`read` does; what libraries raise becomes a SourceError there."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
 
 
 def checked_dtype(dtype: np.dtype[Any], where: str) -> np.dtype[Any]:
-    """Return ``dtype`` in the machine's byte order.
+    """Return the type in which pixels are read, in the machine's byte order.
+
+    Types that few programs compute with are widened, exactly: float16 to float32, true and false to uint8.
 
     Raises
     ------
     SourceError
-        Where a pixel is not one integer or floating-point number of at most 8 bytes.
+        Where a pixel is not one integer or floating-point number of at most 8 bytes, or one bit.
     """
-    if dtype.kind not in "iuf" or dtype.itemsize > 8:
-        kinds = {"c": "complex numbers", "b": "true or false", "V": "several values a pixel"}
+    if dtype.kind not in "iufb" or dtype.itemsize > 8:
+        kinds = {"c": "complex numbers", "V": "several values a pixel", "f": "extended precision"}
         got = f"{dtype} ({kinds[dtype.kind]})" if dtype.kind in kinds else str(dtype)
         raise SourceError(
             "the pixels cannot be used as intensities",
@@ -134,7 +172,14 @@ def checked_dtype(dtype: np.dtype[Any], where: str) -> np.dtype[Any]:
             got,
             "Convert the movie, for example to its modulus, and save it as uint16 or float32",
         )
-    return dtype.newbyteorder("=")
+    return np.dtype({"b1": "u1", "f2": "f4"}.get(dtype.str[1:], dtype)).newbyteorder("=")
+
+
+def widened(frames: Frames, dtype: np.dtype[Any]) -> Frames:
+    """Return frames as stored (any order of bytes and of axes) as an array of a type from :func:`checked_dtype`."""
+    if frames.dtype.kind == "b":
+        frames = frames.view(np.uint8) != 0  # what is not 0 is true, also where a byte is not 1
+    return np.ascontiguousarray(frames, dtype)
 
 
 def checked_shape(shape: tuple[int, ...], where: str) -> tuple[int, int, int]:
@@ -158,12 +203,134 @@ def checked_shape(shape: tuple[int, ...], where: str) -> tuple[int, int, int]:
         raise SourceError(
             "the movie has no frames", where, "at least one frame", f"shape {shape}", "Check how it was exported"
         )
+    if n_frames > MOST_FRAMES:
+        raise SourceError(
+            "the number of frames makes no sense",
+            where,
+            f"at most {MOST_FRAMES:,}",
+            f"{n_frames:,}",
+            "The header is damaged: make the copy or the export again",
+        )
     return n_frames, n_y, n_x
+
+
+FRAME_BYTES, RATIO = 64 << 20, 1000
+"""A frame may claim so many bytes, and so many times the bytes of its file, before it is believed to be damaged."""
+
+MOST_FRAMES = 2**31 - 1
+
+
+def checked_claim(n_bytes: int, size: int, where: str, what: str = "one frame") -> None:
+    """Check what a compressed file says of its own size before so much memory is taken; ``size`` is the file's.
+
+    Raises
+    ------
+    SourceError
+        Where no compression makes so much of so little.
+    """
+    if n_bytes > FRAME_BYTES + RATIO * size:
+        raise SourceError(
+            f"{what} would be far larger than the file can hold",
+            where,
+            f"at most {FRAME_BYTES + RATIO * size:,} bytes from a file of {size:,}",
+            f"{n_bytes:,} bytes",
+            "The header is damaged: make the copy or the export again",
+        )
+
+
+def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
+    """Return the status of a file that may be opened, without opening it: to open a pipe would take forever.
+
+    Raises
+    ------
+    SourceError
+        Where it is not there, cannot be looked at, is not a file, or is empty.
+    """
+    if permit is not None:
+        permit(Path(os.path.realpath(path)))
+    with reading(str(path), "the file cannot be opened"):
+        try:
+            status = path.stat()
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise SourceError(
+                f"the link leads to {path.readlink()}, which is not there"
+                if path.is_symlink()
+                else "there is no such file",
+                str(path),
+                remedy="Check the path; on a cluster every worker must see it under the same name",
+            ) from error
+    kind = next((name for test, name in _KINDS.items() if test(status.st_mode)), None)
+    if kind or not status.st_size:
+        raise SourceError(
+            "the file is empty" if kind is None else "this is not a file",
+            str(path),
+            "a file that holds a movie",
+            kind or "no bytes",
+            "Name the movie's file" if kind else "Check the copy: it may not have begun",
+        )
+    return status
+
+
+_KINDS: dict[Callable[[int], bool], str] = {
+    stat.S_ISDIR: "a folder",
+    stat.S_ISFIFO: "a pipe",
+    stat.S_ISSOCK: "a socket",
+    stat.S_ISCHR: "a device",
+    stat.S_ISBLK: "a device",
+}
+
+
+@contextmanager
+def reading(
+    where: str, what: str = "the file cannot be read", remedy: str = "Make the copy or the export again"
+) -> Iterator[None]:
+    """Turn whatever goes wrong in this block into an error of ours: the border between libraries and the rest.
+
+    Raises
+    ------
+    SourceError
+        For what the system and the libraries say of a file; ours pass as they are.
+    TractError
+        Where there is not enough memory, which is not the file's fault.
+    """
+    try:
+        yield
+    except TractError:
+        raise
+    except OSError as error:
+        raise unreadable(where, error, what) from _plain(error)
+    except MemoryError as error:
+        raise TractError(
+            "memory ran out while the movie was read",
+            where,
+            got=_words(error),
+            remedy="Give each worker more memory, for example by fewer workers",
+        ) from error
+    except Exception as error:
+        raise SourceError(what, where, got=_words(error), remedy=remedy) from error
+
+
+def _words(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text[:300] or type(error).__name__
+
+
+def _plain(error: OSError) -> OSError:
+    """Return the system's own error where HDF5 hides its number in a sentence."""
+    found = re.search(r"errno = (\d+)", str(error)) if error.errno is None else None
+    return OSError(int(found[1]), os.strerror(int(found[1]))) if found and int(found[1]) else error
 
 
 def unreadable(where: str, error: OSError, what: str = "the file cannot be read") -> SourceError:
     """Return the error for what the system, or a library on its behalf, says of a file."""
-    reason = error.strerror or " ".join(str(error).split())
+    if "unable to lock file" in str(error):
+        return SourceError(
+            "another program has locked the file",
+            where,
+            got=_words(error),
+            remedy="Wait until it has been written, or close it there",
+        )
+    reason = error.strerror or _words(error)
     return SourceError(what, where, got=reason, remedy="Check that it is there, its permissions, and its disk")
 
 

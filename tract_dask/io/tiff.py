@@ -35,8 +35,7 @@ class PagedSource(Source):
         """Whether frames that are read one by one take no longer than many at once."""
         return True
 
-    def read(self, start: int, stop: int) -> Frames:
-        """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
+    def _read(self, start: int, stop: int) -> Frames:
         directories = self.directories[start:stop]
         frames = np.empty((len(directories), *self.shape[1:]), self.dtype)
         k = 0

@@ -23,7 +23,6 @@ from .entrance.gate import Gate
 from .entrance.headers import BodyLimit, SecurityHeaders
 from .entrance.login import login
 from .feed import Feed
-from .folders import DataRoot
 from .jobs.store import JobStore
 from .metrics import CountRequests, Metrics
 from .pages import pages, static_files
@@ -70,7 +69,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         lifespan=lifespan,
     )
     config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
-    app.state.config, app.state.root = config, DataRoot(config.data_root)
+    app.state.config, app.state.root = config, config.root
     app.state.store = JobStore(config.database)
     app.state.workshop = Workshop(memory=min(REQUEST_BYTES, local_memory_limit(config.cluster)))
     app.state.exports = Exports(config.state / "exports", app.state.workshop)

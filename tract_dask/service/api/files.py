@@ -109,6 +109,6 @@ async def about_file(
     """Read what a movie says about itself, without its pixels."""
     state = request.app.state
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
-    place = await run_in_threadpool(state.root.source, path)
-    found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, about=state.root.path / path)
+    place, file = await run_in_threadpool(state.root.source, path), state.root.path / path
+    found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit, about=file)
     return found | {"path": path}
