@@ -298,4 +298,4 @@ def test_a_mark_is_whole_and_is_no_result(root):
     assert set(found["made"]) == left
     seal(DataRoot(root), Mark("ana", "other", "run"))  # not its folder any more
     assert read_mark(root / "run").job == "0123456789"
-    assert [entry.name for entry in DataRoot(root).listing("run") if entry.name.startswith(".")] == []
+    assert [entry.name for entry in DataRoot(root).listing("run").entries if entry.name.startswith(".")] == []

@@ -22,7 +22,7 @@ from .folders import OutsideError
 from .jobs.store import ConflictError, JobStoreError, UnknownJobError, UnknownVersionError
 from .jobs.tables import store_error
 from .pages import error_page
-from .refusals import ForbiddenError, NoTokenError, TooLargeError, TooManyError
+from .refusals import ForbiddenError, InvalidError, NoTokenError, TooLargeError, TooManyError, invalid
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +36,7 @@ STATUS: dict[type[TractError], int] = {
     MissingStoreError: 404,
     ConflictError: 409,
     TooLargeError: 413,
+    InvalidError: 422,
     CrashError: 422,
     ExhaustedError: 422,
     TooManyError: 429,
@@ -122,8 +123,7 @@ def _store_fails(request: Request, error: Exception) -> Response:
 def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     first: Mapping[str, Any] = error.errors()[0]
-    where = ".".join(str(part) for part in _place(first.get("loc", ())))
-    problem = TractError(str(first.get("msg", "a field is invalid")), where, remedy="Correct it and send it again")
+    problem = invalid(str(first.get("msg", "a field is invalid")), _place(first.get("loc", ())))
     return JSONResponse(body(problem), HTTPStatus.UNPROCESSABLE_ENTITY)
 
 

@@ -432,12 +432,21 @@ def _answered(task: bytes, limit: int) -> tuple[Exception | int | None, bytes]:
     try:
         function, args = pickle.loads(task)
         return None, pickle.dumps(function(*args))
-    except TractError as error:
-        return error, b""
-    except MemoryError:
-        return limit, b""
-    except Exception:  # noqa: BLE001 (the worker goes on)
+    except Exception as error:  # noqa: BLE001 (the worker goes on)
+        if _is_starved(error):
+            return limit, b""
+        if isinstance(error, TractError):
+            return error, b""
         return RuntimeError(f"in the workshop:\n{format_exc()}"), b""
+
+
+def _is_starved(error: BaseException | None) -> bool:
+    """Tell whether memory ran out, whatever the error was made into since."""
+    while error is not None:
+        if isinstance(error, MemoryError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _memory() -> int:
