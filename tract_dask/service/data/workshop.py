@@ -146,13 +146,15 @@ class Workshop:
         WorkshopError
             Where too many tasks wait, the time is up, or the process was killed twice.
         """
-        return await self._at(self._short, _Task(function, args, timeout_s, str(about)))
+        value: T = await self._at(self._short, _Task(function, args, timeout_s, str(about)))
+        return value
 
     async def run_long(
         self, function: Callable[..., T], *args: Any, timeout_s: float = 3600.0, about: str | Path = ""
     ) -> T:
         """Do the same in a process of its own, one such task at a time: for what takes longer than a glance."""
-        return await self._at(self._long, _Task(function, args, timeout_s, str(about)))
+        value: T = await self._at(self._long, _Task(function, args, timeout_s, str(about)))
+        return value
 
     async def _at(self, bench: _Bench, task: _Task) -> Any:
         if task.about:
