@@ -283,6 +283,16 @@ def test_a_shape_that_is_none_is_refused(api, root, shape):
     assert 400 <= answer.status_code < 500, answer.text
 
 
+def test_jobs_with_long_settings_come_in_shorter_pages(api):
+    store = api.app.state.store
+    text = "x" * 400_000
+    jobs = [store.submit(source=f"{k}", settings={"fit": {"a": text}}, owner="local") for k in range(12)]
+    first = api.get("jobs", params={"limit": 100}).json()
+    assert [job["id"] for job in first["jobs"]] == [job.id for job in jobs[:-6:-1]]
+    rest = api.get("jobs", params={"limit": 100, "before": first["next"]}).json()
+    assert rest["jobs"][0]["id"] == jobs[-6].id
+
+
 # --- the event loop --------------------------------------------------------------------------------------------------
 
 
