@@ -562,7 +562,7 @@ def test_serve_refuses_what_cannot_work(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         serve(certificates=tmp_path / "none", port=0)
     with (
-        serving.stores.sole_use(ServiceConfig(tmp_path).lock, "another"),
+        serving.sole_use(ServiceConfig(tmp_path).lock, "another"),
         pytest.raises(DestinationError, match="another service works on this data root"),
     ):
         serve(port=0)

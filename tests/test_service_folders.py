@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import socket
 from functools import partial
 from itertools import product
 
@@ -13,7 +14,7 @@ from tract_dask.errors import InputError, MissingStoreError
 from tract_dask.io import FileList
 from tract_dask.service.app import create_app
 from tract_dask.service.config import ServiceConfig
-from tract_dask.service.folders import DataRoot, OutsideError
+from tract_dask.service.folders import DataRoot, OutsideError, Page
 
 SECRET = "nobody may read this"
 OPENED = "the file would be opened now"
@@ -93,7 +94,10 @@ def test_no_trick_leaves_the_root(root):
                 followed[ask.__name__, trick] = ask(trick)
             except (OutsideError, MissingStoreError):
                 continue
-    folder_of_links = {("resolve", "frames"): root / "frames", ("listing", "frames"): []}  # to be named, not to be read
+    folder_of_links = {
+        ("resolve", "frames"): root / "frames",
+        ("listing", "frames"): Page([], None),
+    }  # to be named, not to be read
     assert followed == folder_of_links
 
 
@@ -136,7 +140,7 @@ def test_a_data_root_may_be_a_link_itself(root, tmp_path):
 
 
 def test_a_listing_shows_movies_folders_and_files(root):
-    found = [(entry.path, entry.kind, entry.bytes) for entry in DataRoot(root).listing()]
+    found = [(entry.path, entry.kind, entry.bytes) for entry in DataRoot(root).listing().entries]
     assert found == [
         ("clean", "folder", None),
         ("folder", "folder", None),
@@ -147,7 +151,7 @@ def test_a_listing_shows_movies_folders_and_files(root):
         ("movie.zarr", "movie", None),
         ("results.zarr", "file", None),
     ]
-    inner = DataRoot(root).listing("same")
+    inner = DataRoot(root).listing("same").entries
     assert [(entry.path, entry.kind) for entry in inner] == [
         ("same/back.tif", "movie"),
         ("same/inner.mrc", "movie"),
@@ -159,7 +163,7 @@ def test_a_listing_shows_movies_folders_and_files(root):
 class NobodyWorks:
     """Stands where files are opened: what a request gets there has passed every check of its path."""
 
-    async def run(self, function, *args):
+    async def run(self, function, *args, **limits):
         raise InputError(OPENED)
 
 
@@ -258,3 +262,64 @@ def test_no_trick_leaves_the_folder_of_static_files(app):
                 assert await status(path) in (400, 404, 405), path
 
     asyncio.run(look())
+
+
+def test_a_listing_comes_in_pages(tmp_path):
+    names = [f"{k:03}.tif" for k in range(23)] + ["B.zarr", "a é ½.mrc"]
+    for name in names[:-2]:
+        (tmp_path / name).touch()
+    (tmp_path / "a é ½.mrc").touch()
+    (tmp_path / "B.zarr").mkdir()
+    for name in ("y", "Z"):
+        (tmp_path / name).mkdir()
+    data, found, after, pages = DataRoot(tmp_path), [], "", 0
+    while after is not None:
+        page = data.listing("", after, 5)
+        assert len(page.entries) <= 5
+        found += [entry.name for entry in page.entries]
+        after, pages = page.next, pages + 1
+    assert pages == 6
+    assert found == ["y", "Z", *names[:-2], "a é ½.mrc", "B.zarr"]
+    assert [entry.name for entry in data.listing().entries] == found
+
+
+def test_only_a_page_s_entries_are_looked_at(tmp_path, monkeypatch):
+    for k in range(300):
+        (tmp_path / f"{k}.tif").touch()
+    asked = []
+    resolve = DataRoot.resolve
+
+    def counted(self, *path, **more):
+        asked.append(path)
+        return resolve(self, *path, **more)
+
+    monkeypatch.setattr(DataRoot, "resolve", counted)
+    DataRoot(tmp_path).listing("", "", 10)
+    assert len(asked) <= 11
+
+
+@pytest.mark.parametrize("after", ["1zz", "x", "1f"])
+def test_a_page_that_is_none_is_refused(tmp_path, after):
+    with pytest.raises(InputError, match="no such page"):
+        DataRoot(tmp_path).listing("", after)
+
+
+def test_names_that_are_not_utf8_are_shown_and_pipes_left_out(tmp_path):
+    (tmp_path / "good.tif").touch()
+    (tmp_path / os.fsdecode(b"caf\xe9.tif")).touch()
+    os.mkfifo(tmp_path / "pipe.tif")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "s.tif"))
+    (tmp_path / "fake.zarr").mkdir()
+    os.mkfifo(tmp_path / "fake.zarr" / "zarr.json")  # is not waited for
+    found = [(entry.name, entry.path, entry.kind) for entry in DataRoot(tmp_path).listing().entries]
+    assert found == [
+        ("caf\\xe9.tif", "", "unusable"),
+        ("fake.zarr", "fake.zarr", "file"),
+        ("good.tif", "good.tif", "movie"),
+    ]
+    for page in (DataRoot(tmp_path).listing("", "", 1), DataRoot(tmp_path).listing()):
+        json.dumps([page.next, *(entry.name for entry in page.entries)], ensure_ascii=False).encode()
+    for name in ("pipe.tif", "s.tif"):
+        with pytest.raises(OutsideError, match="neither a file nor a folder"):
+            DataRoot(tmp_path).source(name)

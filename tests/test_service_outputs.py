@@ -12,6 +12,7 @@ from serviced import make_app, make_root
 
 from tract_dask import stores
 from tract_dask.errors import DestinationError, InputError, TractError
+from tract_dask.locks import sole_use
 from tract_dask.pipeline import Outputs
 from tract_dask.service.folders import DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
@@ -254,7 +255,7 @@ def test_a_folder_that_another_job_has_taken_stays(app, root, clients):
 def test_a_folder_is_left_while_a_run_works_there_and_where_a_link_leads_to_it(app, root, clients):
     job, folder = done(app, root, clients["ana"], output="run")
     linked = submit(clients["ana"])
-    with stores.sole_use(folder / ".lock", "another"):
+    with sole_use(folder / ".lock", "another"):
         answer = delete(clients["ana"], job)
     assert "another run works in this folder" in answer["kept"]
     assert str(root) not in answer["kept"]
@@ -301,4 +302,4 @@ def test_a_mark_is_whole_and_is_no_result(root):
     assert set(found["made"]) == left
     seal(DataRoot(root), Mark("ana", "other", "run"))  # not its folder any more
     assert read_mark(root / "run").job == "0123456789"
-    assert [entry.name for entry in DataRoot(root).listing("run") if entry.name.startswith(".")] == []
+    assert [entry.name for entry in DataRoot(root).listing("run").entries if entry.name.startswith(".")] == []

@@ -50,6 +50,9 @@ OUTCOMES = [
     (said(error="no columns"), 1, None, False, State.FAILED),
     (said(error="no workers", lost=True), 1, None, False, State.QUEUED),
     (said(), -9, None, False, State.QUEUED),
+    (said(), -15, None, False, State.QUEUED),
+    *((said(), -sign, None, False, State.FAILED) for sign in (4, 6, 7, 11)),  # ILL, ABRT, BUS, SEGV
+    (said(), -11, "enough", False, State.CANCELLED),
 ]
 
 
@@ -59,8 +62,11 @@ def test_what_becomes_of_a_job_when_its_process_has_ended(store, heard, code, ca
     assert end.state == state
     if state == State.CANCELLED:
         assert end.reason == "enough"
-    if state == State.FAILED:
+    if state == State.FAILED and code > 0:
         assert end.reason == "no columns"
+    elif state == State.FAILED:
+        assert "the reader crashed on this file" in end.reason
+        assert end.reason.startswith(queue(store).source)
     if code == -9:
         assert "SIGKILL" in end.reason
 

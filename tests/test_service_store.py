@@ -1,5 +1,6 @@
 """The store of jobs: what it allows, what it keeps, who comes next, and that nothing that happens to it loses a job."""
 
+import hashlib
 import itertools
 import json
 import multiprocessing
@@ -9,6 +10,7 @@ import signal
 import sqlite3
 import threading
 import time
+from contextlib import closing
 
 import pytest
 from hypothesis import given, settings
@@ -344,7 +346,7 @@ def test_an_older_file_is_brought_up_to_date_and_a_newer_one_refused(jobs, monke
     newer = JobStore(jobs.path)
     assert newer.job(job.id) == job
     assert newer.connection().execute("SELECT extra FROM jobs").fetchone()[0] == "new"
-    assert JobStore(jobs.path).connection().execute("PRAGMA user_version").fetchone()[0] == 2
+    assert JobStore(jobs.path).connection().execute("PRAGMA user_version").fetchone()[0] == len(tables.MIGRATIONS)
     monkeypatch.undo()
     with pytest.raises(StoreError, match="newer version"):
         JobStore(jobs.path)
@@ -353,7 +355,7 @@ def test_an_older_file_is_brought_up_to_date_and_a_newer_one_refused(jobs, monke
 def test_a_step_that_fails_leaves_the_file_at_its_version(jobs, monkeypatch):
     job = submit(jobs)
     monkeypatch.setattr(tables, "MIGRATIONS", (*tables.MIGRATIONS, "DELETE FROM jobs; SELECT nonsense FROM nowhere"))
-    with pytest.raises(sqlite3.OperationalError):
+    with pytest.raises(StoreError, match="no such table"):
         JobStore(jobs.path)
     monkeypatch.undo()
     assert JobStore(jobs.path).job(job.id) == job
@@ -416,3 +418,157 @@ def test_nobody_starves(seed, concurrency, owners):
             queued.remove(job)
             running.append((job, step + chance.randint(1, 10)))
             served[job.owner] = clock(next(ticks))
+
+
+# --- files that are old, damaged, locked, or somebody else's ---------------------------------------------------------
+
+VERSION_1 = "2562789d0d876e3482ef5b7ca15842a73d13c8654f9b214bf0e7f0c8b5212aef"
+"""Of the tables of version 1, which are frozen: there are such files."""
+
+
+@pytest.fixture
+def full(tmp_path):
+    """A store with jobs, closed, all of it in its one file."""
+    made = JobStore(tmp_path / "service.sqlite")
+    for k in range(60):
+        made.submit(source=f"{k}.tif", settings={"fit": list(range(50))}, owner="ana", label="x" * 100)
+    made.connection().execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    made.close()
+    for name in ("-wal", "-shm"):
+        made.path.with_name(made.path.name + name).unlink(missing_ok=True)
+    return made.path
+
+
+def test_a_file_of_version_1_is_copied_and_brought_up_to_date(tmp_path):
+    first = tables.MIGRATIONS[0]
+    assert hashlib.sha256(first.encode()).hexdigest() == VERSION_1
+    path = tmp_path / "service.sqlite"
+    with closing(sqlite3.connect(path)) as db:
+        db.executescript(f"{first}; PRAGMA user_version = 1; PRAGMA journal_mode = WAL;")
+        row = (
+            "0123456789",
+            "two",
+            "ana",
+            "m.tif",
+            "jobs/0123456789",
+            '{"fit": {}}',
+            0,
+            "queued",
+            "then",
+        )
+        with db:
+            db.execute(
+                "INSERT INTO jobs (id, label, owner, source, output, settings, curate, state, created)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                row,
+            )
+            db.execute("INSERT INTO events (job_id, time, kind, data) VALUES ('0123456789', 'then', 'job', '{}')")
+    brought = JobStore(path)
+    job = brought.job("0123456789")
+    assert (job.label, job.owner, job.settings, job.state) == ("two", "ana", {"fit": {}}, State.QUEUED)
+    assert brought.change(job.id, State.RUNNING).attempts == 1
+    assert brought.connection().execute("PRAGMA user_version").fetchone()[0] == len(tables.MIGRATIONS)
+    copy = path.with_name("service.sqlite.version-1")
+    with closing(sqlite3.connect(copy)) as db:
+        assert db.execute("PRAGMA user_version").fetchone()[0] == 1
+        assert db.execute("SELECT id, state FROM jobs").fetchall() == [("0123456789", "queued")]
+    assert copy.stat().st_mode & 0o777 == 0o600
+    assert sorted(file.name for file in tmp_path.iterdir() if not file.name.endswith(("-wal", "-shm"))) == [
+        "service.sqlite",
+        "service.sqlite.version-1",
+    ]
+    JobStore(path)  # and once more, with nothing to do
+
+
+def test_without_room_for_the_copy_nothing_is_changed(full, monkeypatch):
+    monkeypatch.setattr(tables, "MIGRATIONS", (*tables.MIGRATIONS, "DELETE FROM jobs"))
+
+    class Full(sqlite3.Connection):
+        def backup(self, *_: object, **__: object) -> None:
+            raise sqlite3.OperationalError("database or disk is full")
+
+    connect = sqlite3.connect
+    monkeypatch.setattr(store.sqlite3, "connect", lambda *a, **more: connect(*a, **more, factory=Full))
+    with pytest.raises(StoreError, match="disk is full"):
+        JobStore(full)
+    monkeypatch.undo()
+    assert len(JobStore(full).jobs(limit=100)) == 60
+    assert not list(full.parent.glob(".*partial"))
+
+
+def overwrite(start: int, data: bytes):
+    def damage(path) -> None:
+        with path.open("r+b") as file:
+            file.seek(start)
+            file.write(data)
+
+    return damage
+
+
+def cut(path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def replace_by_log(path) -> None:
+    path.unlink()
+    path.with_name(path.name + "-wal").write_bytes(bytes(1000))
+
+
+def replace_by_folder(path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def replace_by_pipe(path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def replace_by_another_program_s(path) -> None:
+    path.unlink()
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("CREATE TABLE bookmarks (address TEXT)")
+
+
+def lock_exclusively(path) -> None:
+    monster = sqlite3.connect(path, isolation_level=None)
+    monster.execute("PRAGMA locking_mode = EXCLUSIVE")
+    monster.execute("BEGIN EXCLUSIVE")
+    monster.execute("UPDATE jobs SET label = 'z'")
+    LOCKED.append(monster)
+
+
+LOCKED = []
+
+
+@pytest.mark.parametrize(
+    ("damage", "what", "remedy"),
+    [
+        (overwrite(0, bytes(range(256)) * 16), "is not a database", "Restore it from a backup"),
+        (overwrite(0, b"sQLite"), "is not a database", "Restore it from a backup"),
+        (overwrite(8192, bytes(4096)), "is damaged", "Restore it from a backup"),
+        (cut, "is damaged", "Restore it from a backup"),
+        (replace_by_log, "is gone, and its log is still there", "service.sqlite-wal aside"),
+        (replace_by_folder, "is not a file", "Move it aside"),
+        (replace_by_pipe, "is not a file", "Move it aside"),
+        (replace_by_another_program_s, "is not a job store", "Move it aside"),
+        (lock_exclusively, "is locked by another program", "Stop the program"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named_with_what_to_do(full, monkeypatch, damage, what, remedy):
+    monkeypatch.setattr(store, "BUSY_TIMEOUT_S", 0.2)
+    damage(full)
+    try:
+        with pytest.raises(StoreError) as caught:
+            JobStore(full)
+    finally:
+        while LOCKED:
+            LOCKED.pop().close()
+    assert caught.value.where == str(full)
+    assert what in caught.value.what or what in str(caught.value)
+    assert remedy in caught.value.remedy
+
+
+def test_an_empty_file_is_a_new_store(tmp_path):
+    (tmp_path / "service.sqlite").touch()
+    assert JobStore(tmp_path / "service.sqlite").jobs() == []

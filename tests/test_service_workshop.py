@@ -7,9 +7,11 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tract_dask.errors import SettingsError
+from tract_dask.service.data.crashes import CrashError, ExhaustedError
 from tract_dask.service.data.workshop import Shelf, Workshop, WorkshopError
 
 
@@ -129,3 +131,106 @@ def test_a_shelf_holds_what_was_asked_for_last():
     assert [name for name in "acdefghi" if shelf.get(name)] == list("acdefghi")
     shelf.put("large", bytes(11))
     assert shelf.get("large") is None
+
+
+# --- files that kill or starve a reader -----------------------------------------------------------------------------
+
+
+def crash(file: str, sign: int) -> None:
+    with Path(file).open("a") as calls:
+        calls.write("x")
+    os.kill(os.getpid(), sign)
+
+
+def crash_once(file: str) -> int:
+    """Crash in a process that has done something before: one that was spoilt by it."""
+    if not Path(file).read_text():
+        crash(file, signal.SIGSEGV)
+    return os.getpid()
+
+
+def fill(size: int) -> int:
+    return len(np.ones(size, np.uint8))
+
+
+def sum_mapped(file: str) -> int:
+    return int(np.load(file, mmap_mode="r")[:: 1 << 20].sum())
+
+
+@pytest.mark.parametrize("sign", ["SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL"])
+def test_a_file_that_crashes_its_reader_is_named_and_not_opened_again_at_once(workshop, tmp_path, sign):
+    file = tmp_path / "bad.h5"
+    file.touch()
+    for _ in range(3):
+        with pytest.raises(CrashError, match=rf"bad.h5: the reader crashed on this file.*got {sign}.*write it again"):
+            asked(workshop, crash, str(file), signal.Signals[sign], about=file)
+    assert file.read_text() == "xx"  # once, and once more in a new process
+    assert asked(workshop, math.sqrt, 9.0) == 3
+
+
+def test_a_file_that_was_written_again_is_opened(workshop, tmp_path):
+    file = tmp_path / "bad.h5"
+    file.touch()
+    with pytest.raises(CrashError):
+        asked(workshop, crash, str(file), signal.SIGSEGV, about=f"{file}::/inside")
+    file.write_bytes(b"mended")
+    assert asked(workshop, math.sqrt, 9.0, about=f"{file}::/inside") == 3
+
+
+def test_a_file_is_not_blamed_for_what_the_process_did_before(workshop, tmp_path):
+    file = tmp_path / "good.h5"
+    file.touch()
+    first = asked(workshop, os.getpid)
+    assert asked(workshop, crash_once, str(file), about=file) != first
+    assert asked(workshop, math.sqrt, 9.0, about=file) == 3
+
+
+def test_a_killed_process_is_not_the_file_s_fault(workshop, tmp_path):
+    with pytest.raises(WorkshopError, match="the process that did this died"):
+        asked(workshop, die, about=tmp_path)
+
+
+def test_a_reader_that_does_not_come_to_an_end_is_ended_and_its_file_named(workshop, tmp_path):
+    file = tmp_path / "endless.tif"
+    file.touch()
+    with pytest.raises(CrashError, match=r"endless.tif: the reader does not come to an end with this file"):
+        asked(workshop, time.sleep, 60, timeout_s=0.2, about=file)
+    began = time.monotonic()
+    with pytest.raises(CrashError):
+        asked(workshop, time.sleep, 60, about=file)
+    assert time.monotonic() - began < 10
+
+
+def test_others_get_their_answers_while_a_file_crashes_readers(tmp_path):
+    workshop = Workshop(2, imported=())
+
+    async def together():
+        bad = [workshop.run(crash, str(tmp_path / f"{k}.h5"), signal.SIGSEGV, about=f"{k}.h5") for k in range(3)]
+        good = [workshop.run(math.sqrt, float(k * k), about=f"{k}.tif") for k in range(10)]
+        return await asyncio.gather(*bad, *good, return_exceptions=True)
+
+    try:
+        found = asyncio.run(together())
+    finally:
+        workshop.close()
+    assert [type(error) for error in found[:3]] == [CrashError] * 3
+    assert [error.where for error in found[:3]] == ["0.h5", "1.h5", "2.h5"]
+    assert found[3:] == list(range(10))
+
+
+def test_memory_of_a_task_is_limited_and_mapped_files_do_not_count(tmp_path):
+    size = 1 << 30
+    mapped = np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.uint8, (size,))
+    mapped[0] = 7
+    mapped.flush()
+    workshop = Workshop(1, memory=512 << 20, imported=())
+    try:
+        assert asked(workshop, sum_mapped, str(tmp_path / "large.npy")) == 7
+        assert asked(workshop, fill, 400 << 20) == 400 << 20
+        first = asked(workshop, os.getpid)
+        with pytest.raises(ExhaustedError, match=r"x.tif: this needs more memory .* at most 537 MB"):
+            asked(workshop, fill, size, about="x.tif")
+        assert asked(workshop, os.getpid) != first
+        assert asked(workshop, sum_mapped, str(tmp_path / "large.npy")) == 7
+    finally:
+        workshop.close()

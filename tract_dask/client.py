@@ -274,7 +274,13 @@ class ServiceClient:
 
     def files(self, folder: str = "") -> list[dict[str, Any]]:
         """Return what a folder under the data root holds: name, path, kind, bytes, modified."""
-        return list(self._ask("GET", "/files", params={"path": folder})["entries"])
+        entries: list[dict[str, Any]] = []
+        after: str | None = ""
+        while after is not None:
+            page = self._ask("GET", "/files", params={"path": folder, "after": after})
+            entries += page["entries"]
+            after = page["next"]
+        return entries
 
     def about(self, source: str) -> dict[str, Any]:
         """Return what a movie under the data root says about itself."""

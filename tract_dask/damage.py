@@ -20,8 +20,10 @@ from zarr.registry import register_pipeline
 from zarr.storage import LocalStore, StorePath
 
 from .errors import StoreError
+from .small_files import read_small
 
 METADATA = "zarr.json"
+_METADATA_BYTES = 16 << 20
 
 FRAME_AXES = ("t", "frame")
 """Names of the axis along which the frames lie."""
@@ -65,7 +67,7 @@ def read_json(file: Path) -> dict[str, Any]:
         Where it is no such file, or cannot be read.
     """
     try:
-        found = json.loads(file.read_bytes())
+        found = json.loads(read_small(file, _METADATA_BYTES))
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except OSError as error:

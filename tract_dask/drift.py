@@ -12,6 +12,7 @@ mean of all other shards, to sub-pixel.
 from __future__ import annotations
 
 import csv
+import io
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -50,6 +51,7 @@ from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
 from .shards import Shard, Shards, split
+from .small_files import read_small
 from .stores import load_array
 
 Bools = NDArray[np.bool_]
@@ -136,7 +138,8 @@ def estimate_drift(
 def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
     """Return the drift in a CSV file with columns frame, y, x: (frames, 2) in px, as it stands there.
 
-    Rows may come in any order; other columns are ignored; frames count from 0.
+    Rows may come in any order; other columns are ignored; frames count from 0. The file may have 1 MiB and 512 bytes
+    a frame.
 
     Raises
     ------
@@ -148,7 +151,8 @@ def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
     drift = np.full((n_frames, 2), np.nan)
     line_of: dict[int, int] = {}
     try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+        text = read_small(path, (1 << 20) + 512 * n_frames).decode("utf-8-sig")
+        with io.StringIO(text, newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             header = [name.strip() for name in reader.fieldnames or ()]
             reader.fieldnames = header
@@ -163,7 +167,7 @@ def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
                     what = f"frame {frame} is there twice"
                     raise SourceError(what, where, "each frame once", f"also in line {line_of[frame]}", remedy)
                 line_of[frame], drift[frame] = reader.line_num, shift
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SourceError("the drift file cannot be read", str(path), got=str(error), remedy=remedy) from error
     absent = np.flatnonzero(np.isnan(drift[:, 0]))
     if absent.size:

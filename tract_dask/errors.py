@@ -2,6 +2,23 @@
 
 from __future__ import annotations
 
+_LONGEST = 200
+
+
+def shown(value: object) -> str:
+    """Return a value as an error tells it: as Python writes it, the beginning of what is long.
+
+    Examples
+    --------
+    >>> shown("a b"), shown(10**9999)
+    ("'a b'", 'a very large number')
+    """
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes integers of some thousand digits only
+        return "a very large number"
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
 
 class TractError(Exception):
     """An error with its place and its remedy; its text is one paragraph.

@@ -26,6 +26,7 @@ from .fit import FitSummary
 from .io import FileList, FrameSource, Permit, open_source
 from .journal import journal_beside, remove_journal
 from .layout import peak_memory, plan_layout
+from .locks import sole_use
 from .movie import Movie, open_movie
 from .progress import (
     REPORT,
@@ -41,7 +42,7 @@ from .progress import (
     silent,
     tee,
 )
-from .seeds import read_columns_csv
+from .seeds import read_columns_csv, settings_lattices
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import split
 from .stages import clear_columns, columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
@@ -365,7 +366,7 @@ def _run(
 ) -> RunOutcome:
     """Run the stages in their order, and stop after ``until``."""
     record, made = _Record(), _Made()
-    send = tee((record, JsonLines(outputs.events), on_event))
+    send = tee((record, JsonLines(outputs.events, on_event), on_event))
     plan = plan_run(source.shape, source.dtype, settings)
     with _Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
         stores.write_aside(outputs.settings, _run_toml(settings, {}).encode())
@@ -583,6 +584,8 @@ def check_inputs(source: FrameSource, settings: RunSettings) -> None:
 
         table = _required(settings.columns.csv, "--columns")
         check_inside(read_columns_csv(table), source.shape[1:], str(table))
+    if settings.columns.method == "lattice":
+        settings_lattices(settings.columns.lattices)
     if settings.fit.window_px is not None:
         check_window(settings.fit.window_px, source.shape[1:])
     local_memory_limit(settings.cluster)
@@ -668,7 +671,7 @@ def sole_run(outputs: Outputs, patience_s: float = 0.0) -> Iterator[None]:
     DestinationError
         Where another run holds it.
     """
-    with stores.sole_use(outputs.root / ".lock", "another run works in this folder", patience_s):
+    with sole_use(outputs.root / ".lock", "another run works in this folder", patience_s):
         yield
 
 

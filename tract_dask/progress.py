@@ -6,7 +6,9 @@ A sink is any callable that takes one event. A run knows nothing of terminals, f
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,6 +20,8 @@ STAGES = ("convert", "drift", "sum", "columns", "fit")
 
 REPORT = "report"
 """What a run makes after its stages."""
+
+_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0)
 
 
 @dataclass(frozen=True)
@@ -105,15 +109,53 @@ def to_record(event: Event) -> dict[str, Any]:
 
 
 class JsonLines:
-    """A sink that appends each event to a file as one line of JSON."""
+    """A sink that appends each event to a file as one line of JSON.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    The record is less than the results: where a line cannot be written (a full disk), the run goes on.
+
+    Parameters
+    ----------
+    path
+        The file; made at the first event.
+    warn
+        Takes a warning, once, where a line could not be written.
+    """
+
+    def __init__(self, path: Path, warn: Sink = silent) -> None:
+        self.path, self._warn = path, warn
+        self._is_whole, self._warned = False, False
 
     def __call__(self, event: Event) -> None:
-        """Append one line; a line is written in one call, so a killed run leaves whole lines."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(to_record(event)) + "\n")
+        """Append one line in one call; a line before it that a killed run or a full disk has torn is ended first."""
+        try:
+            self._append(f"{json.dumps(to_record(event))}\n".encode())
+        except OSError as error:
+            self._is_whole = False
+            if not self._warned:
+                self._warned = True
+                reason = error.strerror or str(error)
+                self._warn(Warned(f"the record of this run is incomplete: {self.path} cannot be written: {reason}"))
+
+    def _append(self, line: bytes) -> None:
+        descriptor = os.open(self.path, _APPEND, 0o666)
+        try:
+            if not self._is_whole and not _ends_a_line(self.path):
+                line = b"\n" + line
+            self._is_whole = False
+            if os.write(descriptor, line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._is_whole = True
+        finally:
+            os.close(descriptor)
+
+
+def _ends_a_line(path: Path) -> bool:
+    """Tell whether what is appended to a file begins a line."""
+    with path.open("rb") as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            return True
+        file.seek(-1, os.SEEK_END)
+        return file.read(1) == b"\n"
 
 
 def tee(sinks: Iterable[Sink]) -> Sink:

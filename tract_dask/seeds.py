@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,19 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from . import schema
-from .errors import SettingsError
+from .errors import SettingsError, shown
 from .schema import Status
+from .small_files import read_small
 
 _FIT_COLUMNS = tuple(name for name in schema.PARAMETERS if name not in ("x", "y"))
+MOST_BYTES = 64 << 20
+"""Bytes of a table of columns."""
+MOST_ROWS = 500_000
+"""Lines of a table of columns."""
+MOST_SITES = 1_000_000
+"""Sites of all lattices together, those outside the image counted."""
+
+_MOST_COUNT = 1_000_000
 _LATTICE_KEYS = ("origin", "a", "a_count", "b", "b_count", "a_repeats", "b_repeats", "kind")
 
 
@@ -94,8 +104,8 @@ def lattice_columns(
     Raises
     ------
     SettingsError
-        Where a position is not two finite numbers, a count or repeat is not a whole number from 1 on, or the three
-        atoms lie on one line.
+        Where a position is not two finite numbers, a count or repeat is not a whole number from 1 to 1,000,000, there
+        are more than :data:`MOST_SITES` sites, or the three atoms lie on one line.
 
     Examples
     --------
@@ -105,12 +115,11 @@ def lattice_columns(
     """
     where = "lattice"
     start, to_a, to_b = (_position(value, name, where) for value, name in ((origin, "origin"), (a, "a"), (b, "b")))
-    counts = {"a_count": a_count, "b_count": b_count, "a_repeats": a_repeats, "b_repeats": b_repeats}
-    for name, count in counts.items():
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise SettingsError(f"{name} cannot be used", where, "a whole number from 1 on", repr(count))
+    for name, count in {"a_count": a_count, "b_count": b_count, "a_repeats": a_repeats, "b_repeats": b_repeats}.items():
+        _check_count(count, name, where)
+    check_sites(a_repeats * b_repeats, where)
     if not isinstance(kind, str):
-        raise SettingsError("kind cannot be used", where, "text", repr(kind))
+        raise SettingsError("kind cannot be used", where, "text", shown(kind))
     step_a, step_b = (to_a - start) / a_count, (to_b - start) / b_count
     area = abs(step_a[0] * step_b[1] - step_a[1] * step_b[0])
     if area <= 1e-3 * np.hypot(*step_a) * np.hypot(*step_b):
@@ -127,13 +136,36 @@ def lattice_columns(
     return seeds
 
 
+def _check_count(count: Any, name: str, where: str) -> None:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= _MOST_COUNT:
+        raise SettingsError(f"{name} cannot be used", where, f"a whole number from 1 to {_MOST_COUNT}", shown(count))
+
+
+def check_sites(total: int, where: str, most: int = MOST_SITES) -> None:
+    """Check that lattices have at most ``most`` sites.
+
+    Raises
+    ------
+    SettingsError
+        With both numbers.
+    """
+    if total > most:
+        raise SettingsError(
+            "the lattice has too many sites",
+            where,
+            f"at most {most}",
+            str(total),
+            "Repeat the lattice less often, or check the counts",
+        )
+
+
 def _position(value: Any, name: str, where: str) -> NDArray[np.float64]:
     try:
         position = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         position = np.empty(0)
     if position.shape != (2,) or not np.isfinite(position).all():
-        raise SettingsError(f"{name} is not a position", where, "two numbers [x, y] in px", repr(value))
+        raise SettingsError(f"{name} is not a position", where, "two numbers [x, y] in px", shown(value))
     return position
 
 
@@ -153,11 +185,11 @@ def settings_lattices(lattices: Sequence[Any]) -> list[xr.Dataset]:
             "none",
             "Give origin, a, a_count, b, b_count and the repeats, or choose method auto",
         )
-    found = []
+    found = list[xr.Dataset]()
     for number, table in enumerate(lattices, start=1):
         where = f"setting lattices (ColumnSettings), lattice {number}"
         if not isinstance(table, Mapping):
-            raise SettingsError("this is not a table", where, f"the keys {', '.join(_LATTICE_KEYS)}", repr(table))
+            raise SettingsError("this is not a table", where, f"the keys {', '.join(_LATTICE_KEYS)}", shown(table))
         unknown = [str(key) for key in table if key not in _LATTICE_KEYS]
         missing = [key for key in _LATTICE_KEYS[:5] if key not in table]
         if unknown or missing:
@@ -170,6 +202,7 @@ def settings_lattices(lattices: Sequence[Any]) -> list[xr.Dataset]:
             )
         try:
             found.append(lattice_columns(**table))
+            check_sites(sum(lattice.sizes["column_id"] for lattice in found), where)
         except SettingsError as error:
             raise SettingsError(error.what, where, error.expected, error.got, error.remedy) from None
     return found
@@ -220,11 +253,11 @@ def read_columns_csv(path: str | Path) -> xr.Dataset:
     Raises
     ------
     SettingsError
-        Where the file cannot be read or is empty, x or y is missing, a number is none, or an ID comes twice; naming
-        the line.
+        Where the file cannot be read, is empty or has more than :data:`MOST_BYTES` or :data:`MOST_ROWS`, x or y is
+        missing, a number is none, or an ID comes twice; naming the line.
     """
     try:
-        text = Path(path).read_bytes().decode("utf-8-sig")
+        text = read_small(path, MOST_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise _unreadable(str(path), error) from error
     return parse_columns_csv(text, str(path))
@@ -284,9 +317,11 @@ def _rows(text: str, where: str) -> tuple[list[str], list[tuple[int, list[str]]]
     """Return the names of a table's columns and its (line, values), stripped; x, y and one row are there."""
     reader = csv.reader(io.StringIO(text, newline=""))
     try:
-        lines = [(reader.line_num, [value.strip() for value in row]) for row in reader]
+        lines = [(reader.line_num, [value.strip() for value in row]) for row in islice(reader, MOST_ROWS + 2)]
     except csv.Error as error:
         raise _unreadable(where, error) from error
+    if len(lines) > MOST_ROWS + 1:
+        raise SettingsError("the columns file is too long", where, f"at most {MOST_ROWS} lines", "more", "Shorten it")
     lines = [(line, row) for line, row in lines if any(row) and not row[0].startswith("#")]
     header = lines[0][1] if lines else []
     if not lines or not {"x", "y"} <= set(header):

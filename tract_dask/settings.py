@@ -7,6 +7,7 @@ and the checks come from that declaration.
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import tomllib
 import types
@@ -18,9 +19,12 @@ from typing import Any, TypeVar
 
 import tomli_w
 
-from .errors import SettingsError
+from .errors import SettingsError, shown
 
 T = TypeVar("T")
+
+MOST_ITEMS = 1000
+"""Items of a setting that is a list."""
 
 _LINE = r"[^\n\r]+"
 _WORD = r"[A-Za-z0-9_.:,@+-]+"
@@ -82,7 +86,7 @@ class Settings:
             value = getattr(self, item.name)
             value = tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
             if isinstance(value, int) and not isinstance(value, bool) and plain_type(kinds[item.name]) is float:
-                value = float(value)
+                value = float(value) if abs(value) < 2**1000 else math.inf
             object.__setattr__(self, item.name, value)
             if not isinstance(value, Settings):
                 _check(type(self), item, kinds[item.name], value)
@@ -532,7 +536,7 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "settings") ->
         nested = isinstance(kinds[name], type) and issubclass(kinds[name], Settings)
         if nested and not isinstance(value, dict):
             raise SettingsError(
-                f"{name!r} is a group of settings", where, f"a table [{name}]", repr(value), "Give it a table"
+                f"{name!r} is a group of settings", where, f"a table [{name}]", shown(value), "Give it a table"
             )
         arguments[name] = from_dict(kinds[name], value, f"{where} [{name}]") if nested else value
     return kind(**arguments)
@@ -589,14 +593,16 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
     kind = plain_type(annotation)
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise SettingsError(
-            "the value is of the wrong type", where, kind.__name__, repr(value), meta.get("description", "")
+            "the value is of the wrong type", where, kind.__name__, shown(value), meta.get("description", "")
         )
+    if isinstance(value, tuple):
+        _check_items(where, meta, annotation, value)
     if meta.get("choices") and value not in meta["choices"]:
         raise SettingsError(
             "there is no such choice",
             where,
             f"one of {', '.join(meta['choices'])}",
-            repr(value),
+            shown(value),
             meta["description"],
         )
     if meta.get("pattern"):
@@ -615,15 +621,28 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
             "the value is out of range",
             where,
             f"{bounds} {meta['unit']}".strip(),
-            repr(value),
+            shown(value),
             meta["description"],
+        )
+    if isinstance(value, float) and not math.isfinite(value):
+        raise SettingsError("the value is not finite", where, "a number", repr(value), meta["description"])
+
+
+def _check_items(where: str, meta: Mapping[str, Any], annotation: Any, value: tuple[Any, ...]) -> None:
+    """Check that a list is not too long, and that whole numbers are such where it holds whole numbers."""
+    if len(value) > MOST_ITEMS:
+        raise SettingsError("the list is too long", where, f"at most {MOST_ITEMS}", str(len(value)), "Shorten it")
+    listed = next((arg for arg in typing.get_args(annotation) if typing.get_origin(arg) is tuple), annotation)
+    if int in typing.get_args(listed) and not all(type(item) is int and abs(item) < 2**63 for item in value):
+        raise SettingsError(
+            "the list holds something else", where, "whole numbers", shown(list(value)), meta["description"]
         )
 
 
 def _check_text(where: str, meta: Mapping[str, Any], texts: Iterable[Any]) -> None:
     for text in texts:
         if not isinstance(text, str) or not re.fullmatch(meta["pattern"], text):
-            raise SettingsError("the text has another form", where, meta["form"], repr(text), meta["description"])
+            raise SettingsError("the text has another form", where, meta["form"], shown(text), meta["description"])
 
 
 def _contradiction(name: str, expected: str, got: str, remedy: str) -> SettingsError:

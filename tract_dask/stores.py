@@ -6,12 +6,10 @@ import errno
 import json
 import os
 import shutil
-import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
-from time import monotonic, sleep
 from typing import Any, Literal
 
 import numpy as np
@@ -370,35 +368,6 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
             error.strerror or str(error),
             "Choose another place, or mend its permissions",
         ) from error
-
-
-@contextmanager
-def sole_use(lock: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
-    """Hold the file ``lock`` against other processes; the lock ends with the process, however that ends.
-
-    Raises
-    ------
-    DestinationError
-        Saying ``what`` another process does, where it holds the lock and still does after ``patience_s``.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
-    deadline = monotonic() + patience_s
-    with lock.open("w") as file:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if monotonic() >= deadline:
-                    raise DestinationError(
-                        what, str(lock.parent), remedy="Wait for it, stop it, or choose another place"
-                    ) from error
-            sleep(0.1)
-        yield
 
 
 def check_free_space(path: Path, needed: int) -> None:

@@ -19,6 +19,7 @@ from .conversion import remake
 from .damage import FRAME_AXES, METADATA, remedy
 from .errors import MissingStoreError, StoreError
 from .journal import Journal, journal_beside
+from .locks import sole_use
 from .parts import SHARDED, Parts, layout
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .shard_files import ABSENT, read_index, unchecked
@@ -165,7 +166,7 @@ def repair(found: Verified, on_event: Sink = silent) -> tuple[Path, ...]:
     for movie, faults in movies.items():
         step = stores.attributes(movie)["frames_per_shard"]
         shards = {fault.frames[0] // step for fault in faults if fault.frames and _is_shard(movie, fault.file)}
-        with stores.sole_use(movie.parent / ".lock", "another run works in this folder"):
+        with sole_use(movie.parent / ".lock", "another run works in this folder"):
             remake(
                 movie, shards, everything=not all(_is_shard(movie, fault.file) for fault in faults), on_event=on_event
             )

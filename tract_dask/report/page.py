@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,11 +22,14 @@ from ..analysis.jumps import change_points
 from ..errors import TractError
 from ..provenance import digest_of
 from ..settings import RunSettings, Settings
+from ..small_files import read_small
 from ..web import STATIC, bundle
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import figure_data, windows_data
 from .survey import Survey, residuals, survey
+
+_EVENTS_BYTES = 256 << 20
 
 _SCRIPT = Path(__file__).parent / "page.js"
 KEY = '<meta name="tract-dask-key" content="'
@@ -95,15 +99,13 @@ def _key(folder: Path) -> str:
 
 
 def _events(path: Path) -> list[dict[str, Any]]:
-    """Return the events of a run; a line that is not whole is left out."""
+    """Return the events of a run; a line that is not whole is left out, and all are where they cannot be read."""
     found = []
-    if path.exists():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
+    with suppress(OSError):
+        for line in read_small(path, _EVENTS_BYTES).splitlines():
+            with suppress(ValueError, RecursionError):
                 found.append(json.loads(line))
-            except ValueError:
-                continue
-    return found
+    return [event for event in found if isinstance(event, dict) and "event" in event]
 
 
 def render(run: Survey, key: str = "", *, figures: bool = True) -> str:

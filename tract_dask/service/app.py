@@ -11,6 +11,7 @@ from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer
 from starlette.middleware.errors import ServerErrorMiddleware
 
+from ..cluster import local_memory_limit
 from . import problems
 from .api import columns, events, files, health, jobs, plan, previews, results
 from .config import ServiceConfig
@@ -28,6 +29,9 @@ from .pages import pages, static_files
 from .running.runner import Runner
 
 PREFIX = "/api/v1"
+
+REQUEST_BYTES = 2 << 30
+"""Private memory that a request may take, or as much as a worker of the cluster may have, if that is less."""
 
 _BEARER = HTTPBearer(
     auto_error=False,  # for the document only: the gate has asked already
@@ -66,7 +70,8 @@ def create_app(config: ServiceConfig) -> FastAPI:
     )
     config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
     app.state.config, app.state.root = config, config.root
-    app.state.store, app.state.workshop = JobStore(config.database), Workshop()
+    app.state.store = JobStore(config.database)
+    app.state.workshop = Workshop(memory=min(REQUEST_BYTES, local_memory_limit(config.cluster)))
     app.state.exports = Exports(config.state / "exports", app.state.workshop)
     app.state.feed = Feed(app.state.store)
     app.state.metrics = Metrics(app.state.store, app.state.feed)

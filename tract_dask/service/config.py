@@ -41,7 +41,7 @@ class ServiceConfig:
     trusted_proxy
         Address of the reverse proxy whose X-Forwarded-* headers are believed; "" believes none.
     max_body_bytes
-        Largest body of a request.
+        Largest body of a request with a table of columns; others may have 1 MiB.
     session_hours
         How long a browser stays logged in.
     state_dir

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -46,6 +46,11 @@ def message(event: JobEvent) -> Message:
     else:
         data = public_record(event.data)
     return Message(event.id, event.job_id, chunk(event.id, event.kind, data))
+
+
+def _messages(events: Sequence[JobEvent]) -> list[Message]:
+    """Return events as they go over the wire; made in a thread, since they may be many."""
+    return [message(event) for event in events]
 
 
 def public_record(job: Job | dict[str, Any]) -> dict[str, Any]:
@@ -104,22 +109,22 @@ class Feed:
         try:
             await self._reading()
             while missed := await asyncio.to_thread(self._store.events, after, job_id, _BATCH):
-                for event in missed:
-                    yield message(event).chunk
+                for found in await asyncio.to_thread(_messages, missed):
+                    yield found.chunk
                 after = missed[-1].id
                 if stream.ended or len(missed) < _BATCH:
                     break
             while True:
                 try:
-                    found = await asyncio.wait_for(stream.queue.get(), self._heartbeat_s)
+                    newest = await asyncio.wait_for(stream.queue.get(), self._heartbeat_s)
                 except TimeoutError:
                     yield HEARTBEAT
                     continue
-                if found is None:
+                if newest is None:
                     return
-                if found.id > after:
-                    after = found.id
-                    yield found.chunk
+                if newest.id > after:
+                    after = newest.id
+                    yield newest.chunk
         finally:
             self._streams.discard(stream)
 
@@ -156,9 +161,9 @@ class Feed:
             begun.set()
             while self._streams:
                 events = await asyncio.to_thread(self._store.events, after, None, _BATCH)
-                for event in events:
-                    self._pass_on(message(event))
-                    after = event.id
+                for found in await asyncio.to_thread(_messages, events):
+                    self._pass_on(found)
+                    after = found.id
                 if len(events) < _BATCH:
                     await asyncio.sleep(_POLL_S)
         except Exception:  # noqa: BLE001  whatever it is, the streams must not wait for ever

@@ -10,9 +10,12 @@ from __future__ import annotations
 import os
 import stat
 import unicodedata
+from bisect import bisect_right
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
+from typing import TypeAlias
 
 from .. import stores
 from ..errors import DestinationError, InputError, MissingStoreError
@@ -21,6 +24,12 @@ from ..io.listing import WILD
 
 STATE_FOLDER = ".tract_dask"
 """Where earlier versions kept the service's own store, under the data root; no request reaches it."""
+
+PAGE = 1000
+"""Entries of a page of a listing, where nobody says how many."""
+
+MOST_NAMES = 1_000_000
+"""Entries of a folder that can be listed."""
 
 MAX_NAME_BYTES = 255
 MAX_PATH_BYTES = 2048
@@ -41,8 +50,8 @@ class Entry:
     name, path
         Its name, and its path relative to the data root, with "/" between.
     kind
-        ``folder``; ``movie`` for what a reader opens by its suffix, and for a store with a movie; ``file`` for the
-        rest, other stores (.zarr) among them.
+        ``folder``; ``movie`` for what a reader opens by its suffix, and for a store with a movie; ``unusable`` for what
+        has a name that is not UTF-8, and so no path; ``file`` for the rest, other stores (.zarr) among them.
     bytes
         Size of a file; None for folders and stores.
     modified
@@ -54,6 +63,14 @@ class Entry:
     kind: str
     bytes: int | None
     modified: str
+
+
+@dataclass(frozen=True)
+class Page:
+    """A part of a folder's listing; ``next`` names the one that follows, None: there is none."""
+
+    entries: list[Entry]
+    next: str | None
 
 
 @dataclass(frozen=True)
@@ -262,33 +279,84 @@ class DataRoot:
         found = place.relative_to(self.path).as_posix()
         return "" if found == "." else found
 
-    def listing(self, relative: str = "") -> list[Entry]:
+    def listing(self, relative: str = "", after: str = "", limit: int = PAGE) -> Page:
         """Return what a folder holds: folders first, by name; hidden names, and what :meth:`resolve` refuses, left out.
+
+        A name that is not UTF-8 is shown escaped, and marked as not usable.
+
+        Parameters
+        ----------
+        after
+            :attr:`Page.next` of the page before; "": the first page.
+        limit
+            Entries of a page, at most. Only those are looked at; of the others their names are read.
 
         Raises
         ------
         OutsideError, MissingStoreError
             As :meth:`resolve`; also where it is a file.
+        InputError
+            Where it holds more than :data:`MOST_NAMES` entries, or ``after`` is none.
         """
         place = self.resolve(relative)
         if not place.is_dir():
             raise MissingStoreError("this is a file", relative, "a folder", "a file", "List the folder that it is in")
         with os.scandir(place) as found:
-            entries = [entry for item in found if (entry := self._entry(relative, item)) is not None]
-        return sorted(entries, key=lambda entry: (entry.kind != "folder", entry.name.lower(), entry.name))
+            keys = sorted(_key(item) for item in islice(found, MOST_NAMES + 1) if not item.name.startswith("."))
+        if len(keys) > MOST_NAMES:
+            raise InputError("the folder holds too many files", relative, f"at most {MOST_NAMES}", "more", "Divide it")
+        begin = bisect_right(keys, _cursor_key(after)) if after else 0
+        chosen = keys[begin : begin + limit]
+        entries = [entry for key in chosen if (entry := self._entry(relative, key[-1])) is not None]
+        return Page(entries, _cursor(chosen[-1]) if begin + limit < len(keys) else None)
 
-    def _entry(self, folder: str, item: os.DirEntry[str]) -> Entry | None:
-        if item.name.startswith("."):
-            return None
-        path = f"{folder}/{item.name}" if folder else item.name
+    def _entry(self, folder: str, name: str) -> Entry | None:
+        path = f"{folder}/{name}" if folder else name
+        if not _is_text(name):
+            shown = os.fsencode(name).decode(errors="backslashreplace")
+            return Entry(shown, "", "unusable", None, _moment(0.0))
         try:
             place = self.resolve(path)
             status = place.stat()
         except (InputError, MissingStoreError, OSError):
             return None
-        modified = datetime.fromtimestamp(status.st_mtime, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
         is_folder = stat.S_ISDIR(status.st_mode)
-        return Entry(item.name, path, _kind(place, is_folder), None if is_folder else status.st_size, modified)
+        size = None if is_folder else status.st_size
+        return Entry(name, path, _kind(place, is_folder), size, _moment(status.st_mtime))
+
+
+_Key: TypeAlias = tuple[bool, str, str]
+"""How a folder's entries are sorted: whether it is no folder to be opened, its name folded, its name."""
+
+
+def _key(item: os.DirEntry[str]) -> _Key:
+    try:
+        is_folder = item.is_dir()
+    except OSError:
+        is_folder = False
+    return not is_folder or item.name.lower().endswith(".zarr"), item.name.lower(), item.name
+
+
+def _cursor(key: _Key) -> str:
+    return f"{int(key[0])}{os.fsencode(key[-1]).hex()}"
+
+
+def _cursor_key(cursor: str) -> _Key:
+    try:
+        name = os.fsdecode(bytes.fromhex(cursor[1:]))
+    except ValueError as error:
+        raise InputError("there is no such page", "after", "what the page before gave as next", cursor[:40]) from error
+    return cursor[0] != "0", name.lower(), name
+
+
+def _is_text(name: str) -> bool:
+    return not any(0xD800 <= ord(sign) < 0xE000 for sign in name)
+
+
+def _moment(seconds: float) -> str:
+    """Return a time as listings show it; the nearest that there is for one beyond the calendar."""
+    moment = datetime.fromtimestamp(min(max(seconds, 0.0), 253402300799.0), UTC)
+    return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 def _kind(place: Path, is_folder: bool) -> str:

@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from .. import stores
 from ..errors import DestinationError
 from ..io.listing import WILD
+from ..locks import sole_use
 from ..pipeline import Outputs
 from .folders import DataRoot, OutsideError, folded
 from .refusals import ForbiddenError
@@ -150,7 +151,7 @@ def claim(root: DataRoot, mark: Mark, patience_s: float = 0.0) -> None:
         check_owner(root, mark)
         if not place.exists():
             _make(place, mark)
-        with suppress(FileNotFoundError), stores.sole_use(place / LOCK, "another run works in this folder", patience_s):
+        with suppress(FileNotFoundError), sole_use(place / LOCK, "another run works in this folder", patience_s):
             check_owner(root, mark)
             if place.is_dir() and (mark.named_by_id or read_mark(place) is not None):
                 _write(place, mark)

@@ -34,6 +34,7 @@ STARTUP_S = 10.0
 """What a run takes beside its stages, whatever the movie."""
 
 _PAST_JOBS = 5
+_TRIED_BYTES = 256 << 20
 _WHOLE = frozenset(STAGES)
 
 
@@ -116,7 +117,8 @@ async def check_job(
     settings = job_settings(values)
     place, whole = await to_thread.run_sync(_checked_paths, root, owner, source, settings, output)
     folder = root.path / output if output else None
-    checked = await state.workshop.run(check_source, place, whole, folder, root.permit)
+    file = root.path / source
+    checked = await state.workshop.run(check_source, place, whole, folder, root.permit, about=file)
     return stored_settings(settings), output, checked
 
 
@@ -199,11 +201,16 @@ def _raw_bytes(shape: tuple[int, int, int], dtype: str) -> int:
 
 
 def check_source(place: str | FileList, settings: RunSettings, folder: Path | None, permit: Permit) -> Checked:
-    """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the workshop."""
+    """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the workshop.
+
+    Its first frame is read as well, unless that is very large: some files crash their reader only then.
+    """
     with closing(open_source(place, settings.source, settings.metadata, permit=permit)) as source:
         check_inputs(source, settings)
         if folder is not None and folder.exists():
             check_output(Outputs(folder), source, settings, overwrite=False)
+        if _raw_bytes((1, *source.shape[1:]), source.dtype.name) <= _TRIED_BYTES:
+            source.read(0, 1)
         return Checked(source.shape, source.dtype.name, plan_run(source.shape, source.dtype, settings))
 
 

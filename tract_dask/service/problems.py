@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sqlite3
 from collections.abc import Mapping, Sequence
 from http import HTTPMethod, HTTPStatus
 from typing import Any
@@ -16,10 +17,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Match
 
 from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
+from .data.crashes import CrashError, ExhaustedError
 from .folders import OutsideError
-from .jobs.store import ConflictError, UnknownJobError, UnknownVersionError
+from .jobs.store import ConflictError, JobStoreError, UnknownJobError, UnknownVersionError
+from .jobs.tables import store_error
 from .pages import error_page
-from .refusals import ForbiddenError, NoTokenError, TooLargeError, TooManyError
+from .refusals import ForbiddenError, InvalidError, NoTokenError, TooLargeError, TooManyError, invalid
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +36,11 @@ STATUS: dict[type[TractError], int] = {
     MissingStoreError: 404,
     ConflictError: 409,
     TooLargeError: 413,
+    InvalidError: 422,
+    CrashError: 422,
+    ExhaustedError: 422,
     TooManyError: 429,
+    JobStoreError: 503,
     ClusterError: 503,
     InputError: 400,
     StoreError: 500,
@@ -67,9 +74,12 @@ ERRORS: dict[int | str, dict[str, Any]] = {
     404: {"model": ErrorBody, "description": "There is no such job, file, version or result."},
     409: {"model": ErrorBody, "description": "The job's state forbids it."},
     413: {"model": ErrorBody, "description": "The body is too large."},
-    422: {"model": ErrorBody, "description": "A field is missing or invalid."},
+    422: {
+        "model": ErrorBody,
+        "description": "A field is missing or invalid, or a file makes its reader crash.",
+    },
     500: {"model": ErrorBody, "description": "The service failed."},
-    503: {"model": ErrorBody, "description": "The cluster does not answer."},
+    503: {"model": ErrorBody, "description": "The cluster does not answer, or the job store cannot be used."},
 }
 """What every route of the API may answer with, for its OpenAPI document."""
 
@@ -92,6 +102,7 @@ def body(error: TractError, root: str = "") -> dict[str, dict[str, str]]:
 def install(app: FastAPI) -> None:
     """Let the application answer every error that a route may raise in one shape."""
     app.add_exception_handler(TractError, _tract_error)
+    app.add_exception_handler(sqlite3.Error, _store_fails)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http)
 
@@ -104,11 +115,15 @@ def _tract_error(request: Request, error: Exception) -> Response:
     return _as_asked(request, found)
 
 
+def _store_fails(request: Request, error: Exception) -> Response:
+    assert isinstance(error, sqlite3.Error)
+    return _tract_error(request, store_error(request.app.state.store.path, error))
+
+
 def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     first: Mapping[str, Any] = error.errors()[0]
-    where = ".".join(str(part) for part in _place(first.get("loc", ())))
-    problem = TractError(str(first.get("msg", "a field is invalid")), where, remedy="Correct it and send it again")
+    problem = invalid(str(first.get("msg", "a field is invalid")), _place(first.get("loc", ())))
     return JSONResponse(body(problem), HTTPStatus.UNPROCESSABLE_ENTITY)
 
 
@@ -142,6 +157,8 @@ def _as_asked(request: Request, found: JSONResponse) -> Response:
 
 def unexpected(request: Request, error: Exception) -> Response:
     """Return the response for what nobody foresaw; it tells nothing of it."""
+    if isinstance(error, sqlite3.Error):  # in what stands in front of the routes
+        return _store_fails(request, error)
     problem = TractError(
         "the service failed", f"{request.method} {request.url.path}", remedy="Try again; its log says why it failed"
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ..errors import InputError
 
 
@@ -9,8 +11,17 @@ class ForbiddenError(InputError):
     """Who asks is known, and may not do this."""
 
 
+def invalid(what: str, place: Sequence[int | str]) -> InvalidError:
+    """Return the error for a field that is missing or invalid; ``place`` leads to it."""
+    return InvalidError(what, ".".join(map(str, place)), remedy="Correct it and send it again")
+
+
 class NoTokenError(InputError):
     """Who asks is not known."""
+
+
+class InvalidError(InputError):
+    """A field of the body is missing or invalid."""
 
 
 class TooLargeError(InputError):

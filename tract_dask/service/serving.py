@@ -14,9 +14,9 @@ from urllib.parse import urlsplit
 
 import uvicorn
 
-from .. import stores
 from ..certificates import EXPIRES_SOON_DAYS, SERVICE, SERVICE_KEY, check_certificates
 from ..errors import DestinationError, InputError
+from ..locks import sole_use
 from .config import DATABASE, LOCK, LOOPBACK, ServiceConfig, state_folder
 from .entrance.access import Access, Role, Token
 from .entrance.headers import host_name
@@ -51,7 +51,7 @@ def serve(config: ServiceConfig, say: Callable[[str], None]) -> None:
     config = settled(config)
     prepare_state(config)
     with (
-        stores.sole_use(config.lock, _TAKEN, patience_s=1.0),  # the runner has one of its own, for any application
+        sole_use(config.lock, _TAKEN, patience_s=1.0),  # the runner has one of its own, for any application
         closing(listen(config.host, config.port)) as listener,
     ):
         config = replace(config, port=listener.getsockname()[1])

@@ -8,9 +8,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from .. import stores
 from ..errors import TractError
 from ..journal import journal_beside
+from ..locks import lock_files, sole_use
 from ..pipeline import Outputs
 from .folders import DataRoot, overlap
 from .jobs.store import Job, JobStore
@@ -38,7 +38,7 @@ def delete_folder(root: DataRoot, store: JobStore, job: Job) -> str:
             return f"job {other} uses it, too"
         if not place.exists():
             return ""
-        with stores.sole_use(place / LOCK, "another run works in this folder"):
+        with sole_use(place / LOCK, "another run works in this folder"):
             return _delete(place, Mark(job.owner, job.id, job.output))
     except (TractError, OSError) as error:
         return str(error).replace(f"{root.path}/", "")
@@ -67,8 +67,8 @@ def _delete(place: Path, mark: Mark) -> str:
             _remove(journal_beside(path))
     for aside in place.glob(".*.partial"):
         _remove(aside)
-    for name in () if changed else (MARK, LOCK):
-        (place / name).unlink(missing_ok=True)
+    for file in () if changed else (place / MARK, *lock_files(place / LOCK)):
+        file.unlink(missing_ok=True)
     with suppress(OSError):  # something else is in it
         place.rmdir()
     return f"{', '.join(changed)} changed since the job wrote it" if changed else ""

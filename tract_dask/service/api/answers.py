@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from fastapi import Query, Request, Response
 
+from ...io import FileList
 from ...journal import logs
 
 Version = Annotated[
@@ -42,7 +43,13 @@ def stamp(*paths: Path) -> str:
 
 
 async def kept_answer(
-    request: Request, media_type: str, version: str, function: Callable[..., bytes], *args: Any, said: str = ""
+    request: Request,
+    media_type: str,
+    version: str,
+    function: Callable[..., bytes],
+    *args: Any,
+    about: str | Path | FileList,
+    said: str = "",
 ) -> Response:
     """Return what ``function`` makes of ``args`` in the workshop, or 304 where the client has it.
 
@@ -50,6 +57,8 @@ async def kept_answer(
     ----------
     version
         From :func:`stamp`: of all that the function reads.
+    about
+        The file or folder that it reads.
     said
         The version that the client named in its request.
     """
@@ -57,5 +66,5 @@ async def kept_answer(
     headers = {"ETag": f'"{key}"', "Cache-Control": _FOREVER if said == version else _ASK}
     if key in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
-    content = await request.app.state.workshop.run_kept(key, function, *args)
+    content = await request.app.state.workshop.run_kept(key, function, *args, about=about)
     return Response(content, media_type=media_type, headers=headers)

@@ -5,24 +5,26 @@ Version 0 are the columns that the job's settings find; nothing that was saved i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
+from ...seeds import MOST_SITES
 from ...settings import RunSettings, from_dict
 from ..data import curation
-from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, MOST_SITES, Scene
+from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, Scene
 from ..entrance.access import Identity, Role
 from ..jobs.states import CURATABLE, State
 from ..jobs.store import Job, JobStore
 from ..planning import inside
+from ..refusals import invalid
 from .asking import OwnJob, Who
 from .models import JobId, JobRecord, Plain, Text, errors
 from .previews import folder_of
@@ -234,6 +236,68 @@ class Choice(BaseModel):
     version: _Number = Field(description="0: the columns found automatically.")
 
 
+@dataclass(frozen=True)
+class Given:
+    """The columns of a request: places (columns, 2), kinds and numbers, and what was said beside them."""
+
+    places: NDArray[np.float64]
+    kinds: list[str]
+    column_ids: list[int | None]
+    said: dict[str, Any]
+
+    @property
+    def parts(self) -> tuple[NDArray[np.float64], list[str], list[int | None]]:
+        """What is sent to the workshop."""
+        return self.places, self.kinds, self.column_ids
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def _read(model: type[M], data: bytes) -> M:
+    try:
+        return model.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        raise invalid(first["msg"], first["loc"]) from None
+
+
+def read_columns(model: type[NewVersion] | type[ToRefine], data: bytes) -> Given:
+    """Return what the body of a request says; for a process of the workshop, since it may be long.
+
+    Raises
+    ------
+    InvalidError
+        Naming the first field that is missing or invalid.
+    """
+    found = _read(model, data)
+    places = np.array([(column.x, column.y) for column in found.columns])
+    kinds, ids = [column.kind for column in found.columns], [column.column_id for column in found.columns]
+    return Given(places, kinds, ids, found.model_dump(exclude={"columns"}))
+
+
+def read_lattice(data: bytes) -> tuple[dict[str, Any], NDArray[np.float64]]:
+    """Return a lattice and the columns beside it, (columns, 2); otherwise as :func:`read_columns`."""
+    found = _read(Lattice, data)
+    return found.model_dump(exclude={"beside"}), np.array(found.beside)
+
+
+def _sent(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the declaration of a body that a route reads by itself."""
+    schema = model.model_json_schema()
+    known = schema.pop("$defs", {})
+
+    def inlined(part: Any) -> Any:
+        if isinstance(part, dict):
+            reference = part.get("$ref")
+            return (
+                inlined(known[reference.rpartition("/")[2]]) if reference else {k: inlined(v) for k, v in part.items()}
+            )
+        return [inlined(item) for item in part] if isinstance(part, list) else part
+
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": inlined(schema)}}}}
+
+
 def _answers(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
     """Return the declaration of a route whose answer the workshop makes."""
     return {200: {"model": model}} | errors(400, 404, 503)
@@ -256,7 +320,7 @@ OfJob = Annotated[Scene, Depends(scene_of_job)]
 @router.get("/jobs/{job_id}/columns", response_model=Versions, responses=errors(400, 404, 503))
 async def list_versions(job_id: JobId, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
     """List the versions of a job's columns."""
-    first = await request.app.state.workshop.run(curation.summary, scene)
+    first = await request.app.state.workshop.run(curation.summary, scene, about=scene.sum)
     return await run_in_threadpool(_versions, request.app.state.store, job_id, first, who)
 
 
@@ -265,37 +329,47 @@ async def read_version(job_id: JobId, version: VersionNumber, request: Request, 
     """Read a version of a job's columns."""
     store: JobStore = request.app.state.store
     table = await run_in_threadpool(store.columns, job_id, version) if version else None
-    return _json(await request.app.state.workshop.run(curation.version_json, scene, version, table))
+    return _json(await request.app.state.workshop.run(curation.version_json, scene, version, table, about=scene.sum))
 
 
-@router.post("/jobs/{job_id}/columns", status_code=201, response_model=Saved, responses=errors(400, 404, 503))
-async def save_version(own: OwnJob, new: NewVersion, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
+@router.post(
+    "/jobs/{job_id}/columns",
+    status_code=201,
+    response_model=Saved,
+    responses=errors(400, 404, 503),
+    openapi_extra=_sent(NewVersion),
+)
+async def save_version(own: OwnJob, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
     """Keep columns as a new version of a job's."""
     store, workshop, job_id = request.app.state.store, request.app.state.workshop, own.id
-    first = await workshop.run(curation.summary, scene)
+    new = await workshop.run(read_columns, NewVersion, await request.body())
+    first = await workshop.run(curation.summary, scene, about=scene.sum)
     known = await run_in_threadpool(_versions, store, job_id, first, who)
-    table = await workshop.run(curation.checked_csv, scene, *_parts(new.columns), known["next_column_id"])
-    note = new.note.strip()
-    if new.base is not None:
-        note = f"from version {new.base}: {note}" if note else f"from version {new.base}"
+    table = await workshop.run(curation.checked_csv, scene, *new.parts, known["next_column_id"])
+    note, given_base = new.said["note"].strip(), new.said["base"]
+    if given_base is not None:
+        note = f"from version {given_base}: {note}" if note else f"from version {given_base}"
     version = await run_in_threadpool(store.add_columns, job_id, table, who.name, note)
-    base = version if new.base is None else new.base
+    base = version if given_base is None else given_base
     newer = [one["version"] for one in known["versions"] if one["version"] > base]
-    return {"version": version, "count": len(new.columns), "newer": newer}
+    return {"version": version, "count": len(new.places), "newer": newer}
 
 
-@router.post("/jobs/{job_id}/columns/refine", responses=_answers(Refined))
-async def refine_columns(job_id: JobId, given: ToRefine, request: Request, scene: OfJob) -> Response:
+@router.post("/jobs/{job_id}/columns/refine", responses=_answers(Refined), openapi_extra=_sent(ToRefine))
+async def refine_columns(job_id: JobId, request: Request, scene: OfJob) -> Response:
     """Fit columns in the summed image, as a run that is given them does; nothing is kept."""
-    work = request.app.state.workshop.run(curation.refined_json, scene, *_parts(given.columns), given.spacing_px)
-    return _json(await work)
+    workshop = request.app.state.workshop
+    given = await workshop.run(read_columns, ToRefine, await request.body())
+    spacing_px = given.said["spacing_px"]
+    return _json(await workshop.run(curation.refined_json, scene, *given.parts, spacing_px, about=scene.sum))
 
 
-@router.post("/jobs/{job_id}/columns/lattice", responses=_answers(Sites))
-async def lattice_columns(job_id: JobId, lattice: Lattice, request: Request, scene: OfJob) -> Response:
+@router.post("/jobs/{job_id}/columns/lattice", responses=_answers(Sites), openapi_extra=_sent(Lattice))
+async def lattice_columns(job_id: JobId, request: Request, scene: OfJob) -> Response:
     """Make the sites of a lattice inside the summed image; nothing is kept."""
-    how = lattice.model_dump(exclude={"beside"})
-    return _json(await request.app.state.workshop.run(curation.lattice_json, scene, how, np.array(lattice.beside)))
+    workshop = request.app.state.workshop
+    how, beside = await workshop.run(read_lattice, await request.body())
+    return _json(await workshop.run(curation.lattice_json, scene, how, beside, about=scene.sum))
 
 
 @router.post("/jobs/{job_id}/continue", response_model=JobRecord, responses=errors(400, 404, 409))
@@ -337,12 +411,6 @@ def _highest_id(store: JobStore, job_id: str, version: int) -> int:
     """Return the highest number of a version's columns; versions never change."""
     lines = store.columns(job_id, version).splitlines()[1:]
     return max(int(line.partition(",")[0]) for line in lines)
-
-
-def _parts(columns: Sequence[EditedColumn]) -> tuple[NDArray[np.float64], list[str], list[int | None]]:
-    """Return places (columns, 2), kinds and numbers: what is sent to the workshop."""
-    places = np.array([(column.x, column.y) for column in columns])
-    return places, [column.kind for column in columns], [column.column_id for column in columns]
 
 
 def _json(content: bytes) -> Response:

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from ..folders import Entry
+from ..folders import PAGE, Page
 from ..planning import about_movie
 from .models import RelativePath, Shape, errors
 
@@ -22,7 +22,7 @@ class EntryRecord(BaseModel):
 
     name: str
     path: str = Field(description='Relative to the data root, with "/" between.')
-    kind: str = Field(description="folder, movie, or file for what is neither.")
+    kind: str = Field(description="folder, movie, file for what is neither; or unusable: its name is not UTF-8.")
     bytes: int | None = Field(description="Size of a file; null for folders and stores.")
     modified: str = Field(description="UTC, ISO 8601.")
 
@@ -43,12 +43,14 @@ class Listing(BaseModel):
                         "modified": "2026-11-21T09:12:44Z",
                     }
                 ],
+                "next": None,
             }
         }
     )
 
     path: str
     entries: list[EntryRecord]
+    next: str | None = Field(description="What to give as ``after`` for the next page; null: this is the last.")
 
 
 class About(BaseModel):
@@ -89,11 +91,18 @@ FolderPath = Annotated[RelativePath, Query(description="A folder under the data 
 MoviePath = Annotated[RelativePath, Query(min_length=1, description="A movie under the data root.")]
 
 
-@router.get("/files", response_model=Listing, responses=errors(404))
-def list_files(request: Request, path: FolderPath = "") -> dict[str, Any]:
-    """List a folder: folders first, then movies and other files, by name; hidden ones are left out."""
-    entries: list[Entry] = request.app.state.root.listing(path)
-    return {"path": path, "entries": entries}
+@router.get("/files", response_model=Listing, responses=errors(400, 404))
+def list_files(
+    request: Request,
+    path: FolderPath = "",
+    after: Annotated[
+        str, Query(max_length=600, pattern="^([01][0-9a-f]*)?$", description="``next`` of the page before.")
+    ] = "",
+    limit: Annotated[int, Query(ge=1, le=5000, description="Entries of a page, at most.")] = PAGE,
+) -> dict[str, Any]:
+    """List a folder, page by page: folders first, then movies and other files, by name; hidden ones are left out."""
+    page: Page = request.app.state.root.listing(path, after, limit)
+    return {"path": path, "entries": page.entries, "next": page.next}
 
 
 @router.get("/files/about", response_model=About, responses=errors(400, 404, 503))
@@ -109,6 +118,6 @@ async def about_file(
     """Read what a movie says about itself, without its pixels."""
     state = request.app.state
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
-    place = await run_in_threadpool(state.root.source, path)
-    found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit)
+    place, file = await run_in_threadpool(state.root.source, path), state.root.path / path
+    found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit, about=file)
     return found | {"path": path}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from itertools import accumulate
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -15,6 +17,7 @@ from .models import After, Deleted, JobDetail, JobId, JobList, JobRecord, Label,
 
 router = APIRouter(tags=["jobs"])
 
+_PAGE_BYTES = 2 << 20
 _LINKS = ("events", "log", "columns", "sum", "results", "report")
 
 
@@ -38,18 +41,25 @@ def list_jobs(
     owner: Annotated[Label, Query(description="Only this owner's jobs.")] = "",
     text: Annotated[Label, Query(description="Only jobs with this in label, source, owner or id.")] = "",
     before: Annotated[int | None, Query(ge=0, le=2**53, description="Only jobs with smaller numbers.")] = None,
-    limit: Annotated[int, Query(ge=1, le=500, description="Jobs of a page.")] = 50,
+    limit: Annotated[int, Query(ge=1, le=500, description="Jobs of a page, fewer where their settings are long.")] = 50,
 ) -> dict[str, Any]:
     """List jobs, the newest first."""
     store: JobStore = request.app.state.store
     event = store.newest_event()  # first: what happens meanwhile comes as an event, too
     found = store.jobs(states=state, owner=owner, text=text, before=before, limit=limit + 1)
+    shown = _fitting(found[:limit])
     return {
-        "jobs": found[:limit],
+        "jobs": shown,
         "counts": store.counts(owner=owner, text=text),
-        "next": found[limit - 1].number if len(found) > limit else None,
+        "next": shown[-1].number if len(found) > len(shown) else None,
         "event": event,
     }
+
+
+def _fitting(jobs: list[Job]) -> list[Job]:
+    """Return as many of the first jobs as make a page of a moderate size, at least one."""
+    sizes = accumulate(len(json.dumps(job.settings)) for job in jobs)
+    return [job for job, size in zip(jobs, sizes, strict=True) if size <= _PAGE_BYTES or job is jobs[0]]
 
 
 @router.get("/jobs/{job_id}", response_model=JobDetail, responses=errors(404))

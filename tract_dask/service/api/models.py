@@ -58,32 +58,32 @@ def plain_values(value: dict[str, Any]) -> dict[str, Any]:
     ValueError
         Where a number is not finite or a text not plain, or there is too much of anything.
     """
-    left, level = MAX_ITEMS, [value]
+    left, level = MAX_ITEMS, [("settings", value)]
     for _ in range(MAX_DEPTH):
         left -= len(level)
         if left < 0:
             raise ValueError(f"these are more than {MAX_ITEMS} values")
-        level = [part for item in level for part in _parts(item)]
+        level = [part for name, item in level for part in _parts(name, item)]
     if level:
-        raise ValueError(f"the values are nested more than {MAX_DEPTH} deep")
+        raise ValueError(f"{level[0][0]}: the values are nested more than {MAX_DEPTH} deep")
     return value
 
 
-def _parts(value: Any) -> list[Any]:
-    """Return what a value consists of; a text, a number or nothing has no parts."""
+def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
+    """Return what a value consists of, with names; a text, a number or nothing has no parts."""
     match value:
         case dict():
-            return [*value, *value.values()]
+            return [*((name, key) for key in value), *((f"{name}.{key[:80]}", part) for key, part in value.items())]
         case list():
-            return value
+            return [(f"{name}[{k}]", part) for k, part in enumerate(value)]
         case str() if len(value) > MAX_TEXT:
-            raise ValueError(f"a text has more than {MAX_TEXT} characters")
+            raise ValueError(f"{name}: a text has more than {MAX_TEXT} characters")
         case str():
             plain_text(value)
         case float() if not math.isfinite(value):
-            raise ValueError("a number is not finite")
+            raise ValueError(f"{name}: a number is not finite")
         case int() if abs(value) > 2**53:
-            raise ValueError("a whole number is beyond 2^53")
+            raise ValueError(f"{name}: a whole number is beyond 2^53")
     return []
 
 

@@ -116,7 +116,16 @@ async def frame_picture(
     place, version = await run_in_threadpool(_movie, request, path)
     about = (place, raw, gain, request.app.state.root.permit)
     return await kept_answer(
-        request, "image/png", version, pictures.source_png, *about, frame, seen, version, said=said
+        request,
+        "image/png",
+        version,
+        pictures.source_png,
+        *about,
+        frame,
+        seen,
+        version,
+        about=_file(request, path),
+        said=said,
     )
 
 
@@ -131,7 +140,17 @@ async def frame_histogram(
     """Tell what values a frame has, as frame.png shows it with the same parameters."""
     place, version = await run_in_threadpool(_movie, request, path)
     about = (place, raw, gain, request.app.state.root.permit)
-    return await kept_answer(request, "application/json", version, pictures.source_levels, *about, frame, seen, version)
+    return await kept_answer(
+        request,
+        "application/json",
+        version,
+        pictures.source_levels,
+        *about,
+        frame,
+        seen,
+        version,
+        about=_file(request, path),
+    )
 
 
 @router.get("/jobs/{job_id}/frame.png", response_class=Response, responses=_PICTURE)
@@ -140,9 +159,9 @@ async def job_frame_picture(
 ) -> Response:
     """Show a part of a frame of a job's movie."""
     found, version = await run_in_threadpool(_job_movie, request, job_id)
-    about = (*found, request.app.state.root.permit)
+    opened = (*found, request.app.state.root.permit)
     return await kept_answer(
-        request, "image/png", version, pictures.source_png, *about, frame, seen, version, said=said
+        request, "image/png", version, pictures.source_png, *opened, frame, seen, version, about=found[0], said=said
     )
 
 
@@ -150,15 +169,19 @@ async def job_frame_picture(
 async def job_frame_histogram(job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0) -> Response:
     """Tell what values a frame of a job's movie has, as its frame.png shows it with the same parameters."""
     found, version = await run_in_threadpool(_job_movie, request, job_id)
-    about = (*found, request.app.state.root.permit)
-    return await kept_answer(request, "application/json", version, pictures.source_levels, *about, frame, seen, version)
+    opened = (*found, request.app.state.root.permit)
+    return await kept_answer(
+        request, "application/json", version, pictures.source_levels, *opened, frame, seen, version, about=found[0]
+    )
 
 
 @router.get("/jobs/{job_id}/sum.png", response_class=Response, responses=_PICTURE)
 async def sum_picture(job_id: JobId, request: Request, seen: Seen, said: Version = "") -> Response:
     """Show a part of a job's drift-corrected summed image, in counts of one frame."""
     folder, version = await run_in_threadpool(_sum, request, job_id)
-    return await kept_answer(request, "image/png", version, pictures.sum_png, folder, seen, version, said=said)
+    return await kept_answer(
+        request, "image/png", version, pictures.sum_png, folder, seen, version, about=folder, said=said
+    )
 
 
 @router.get(
@@ -169,7 +192,9 @@ async def sum_picture(job_id: JobId, request: Request, seen: Seen, said: Version
 async def sum_about(job_id: JobId, request: Request, seen: Seen) -> Response:
     """Tell the size of a job's summed image, and what values it has."""
     folder, version = await run_in_threadpool(_sum, request, job_id)
-    return await kept_answer(request, "application/json", version, pictures.sum_levels, folder, seen, version)
+    return await kept_answer(
+        request, "application/json", version, pictures.sum_levels, folder, seen, version, about=folder
+    )
 
 
 def folder_of(request: Request, job_id: str, *names: str) -> Path:
@@ -190,6 +215,12 @@ def folder_of(request: Request, job_id: str, *names: str) -> Path:
     for name in names:
         state.root.store(f"{output}/{name}")
     found: Path = state.root.resolve(output, must_exist=False)
+    return found
+
+
+def _file(request: Request, path: str) -> Path:
+    """Return the file that a path in a request names, to be named in errors."""
+    found: Path = request.app.state.root.path / path
     return found
 
 

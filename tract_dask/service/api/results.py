@@ -138,7 +138,7 @@ async def _answer(request: Request, job_id: str, function: Callable[..., bytes],
     places: tuple[Path, ...] = (path.parent, request.app.state.config.state / "tracks")
     if function is tracks.displacement:
         places = places[:1]
-    return await kept_answer(request, "application/json", version, function, *places, *args, version)
+    return await kept_answer(request, "application/json", version, function, *places, *args, version, about=path)
 
 
 def _results(request: Request, job_id: str) -> tuple[Path, str]:

@@ -24,7 +24,7 @@ from ... import stores
 from ...columns import check_inside, find_columns, lattice_columns
 from ...errors import MissingStoreError, SettingsError
 from ...schema import AMPLITUDE, SIGMA_A, SIGMA_B
-from ...seeds import column_dataset, columns_csv, flag_names, parse_columns_csv, positions
+from ...seeds import check_sites, column_dataset, columns_csv, flag_names, parse_columns_csv, positions
 from ...settings import ColumnSettings, RunSettings, from_toml, to_toml
 from ...windows import default_window, neighbour_distance
 
@@ -32,8 +32,6 @@ MOST_COLUMNS = 200_000
 """Columns of one table."""
 LONGEST_KIND = 64
 """Characters of a kind."""
-MOST_SITES = 1_000_000
-"""Sites of a lattice, those outside the image counted."""
 HIGHEST_ID = 2**53
 """What a number of a column stays below, so that scripts in a browser hold it exactly."""
 
@@ -327,12 +325,8 @@ def lattice_sites(
     Raises
     ------
     SettingsError
-        As :func:`tract_dask.lattice_columns`; where the lattice has more than :data:`MOST_SITES` sites, or more than
-        :data:`MOST_COLUMNS` of them are in the image.
+        As :func:`tract_dask.lattice_columns`; where more than :data:`MOST_COLUMNS` sites are in the image.
     """
-    total = lattice.get("a_repeats", 1) * lattice.get("b_repeats", 1)
-    if total > MOST_SITES:
-        raise _too_many(where, MOST_SITES, total)
     sites = lattice_columns(**lattice)
     places, size = positions(sites), np.array(shape[::-1])
     inside = ((places >= -0.5) & (places < size - 0.5)).all(axis=1)
@@ -343,8 +337,7 @@ def lattice_sites(
         reach = _SAME * min(spacing, neighbour_distance(there) or spacing)
         known = inside & (np.asarray(cKDTree(there).query(places)[0]) <= reach)
     kept = np.flatnonzero(inside & ~known)
-    if len(kept) > MOST_COLUMNS:
-        raise _too_many(where, MOST_COLUMNS, len(kept))
+    check_sites(len(kept), where, MOST_COLUMNS)
     found = column_dataset(places[kept], sites["kind"].to_numpy()[kept].tolist())
     return {
         "columns": to_records(found),
@@ -352,16 +345,6 @@ def lattice_sites(
         "merged": int(known.sum()),
         "spacing_px": spacing,
     }
-
-
-def _too_many(where: str, most: int, got: int) -> SettingsError:
-    return SettingsError(
-        "the lattice has too many sites",
-        where,
-        f"at most {most}",
-        str(got),
-        "Repeat it less often, or check the counts",
-    )
 
 
 def _around(summed: xr.Dataset, places: NDArray[np.float64], margin: float) -> tuple[xr.Dataset, NDArray[np.int64]]:

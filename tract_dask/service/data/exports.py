@@ -57,7 +57,7 @@ class Exports:
         if task is None:
             self._folder.mkdir(parents=True, exist_ok=True)
             _tidy(self._folder)
-            task = asyncio.create_task(self._workshop.run_long(write_file, results, place))
+            task = asyncio.create_task(self._workshop.run_long(write_file, results, place, about=results))
             self._coming[place] = task
             task.add_done_callback(lambda _: self._coming.pop(place))
         done, _ = await asyncio.wait({task}, timeout=wait_s)

@@ -35,6 +35,9 @@ Floats = NDArray[np.float32]
 MAX_SIDE_PX = 2048
 """Longest side of a picture."""
 
+MOST_PIXELS = 1 << 27
+"""Of a frame of a movie that is not converted, which is read as a whole."""
+
 PERCENTILES = (0.1, 0.5, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.5, 99.9)
 CONTRAST = (0.5, 99.5)
 """Percentiles of a picture that are black and white where it is not said what should be."""
@@ -174,6 +177,7 @@ def source_plane(
         return movie_plane(_opened_movie(str(path), stamp), frame)
     opened = open_cached(path, source, metadata, permit=permit)
     _check_frame(frame, opened.shape[0])
+    _check_size(str(path), opened.shape[1:])
 
     def read(_: int, rows: slice, columns: slice) -> Pixels:
         return _source_frame(path, source, permit, frame, stamp)[rows, columns]
@@ -237,6 +241,18 @@ def _summed(path: Path, stamp: str) -> Floats:
     image = np.asarray(stores.open_array(path / "image")[...])
     exposed = np.asarray(stores.open_array(path / "exposure")[...]) > 0
     return np.where(exposed, image, np.nan).astype(np.float32)
+
+
+def _check_size(path: str, shape: tuple[int, ...]) -> None:
+    """Refuse a frame that has to be read as a whole and is too large for that."""
+    if math.prod(shape) > MOST_PIXELS:
+        raise InputError(
+            "the frames are too large to be shown",
+            path,
+            f"at most {MOST_PIXELS} pixels",
+            f"{shape[0]} x {shape[1]}",
+            "Convert the movie: a converted one is read in parts",
+        )
 
 
 def _check_frame(frame: int, n_frames: int) -> None:

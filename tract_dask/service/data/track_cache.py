@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -21,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import results, stores
+from ...locks import sole_use
 from ...schema import AMPLITUDE, REJECTED, Status, X, Y
 
 Floats = NDArray[np.float64]
@@ -37,6 +36,7 @@ _MAX_FITS = 32 << 20
 _KEPT_BYTES = 4 << 30
 _RUN_BYTES = 16 << 20
 _SAVE_S = 3.0
+_PATIENCE_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def open_tracks(path: Path, folder: Path) -> Tracks:
     key = hashlib.sha256(f"{path}\0{stores.attributes(path).get('key')}".encode()).hexdigest()[:20]
     place = folder / key
     place.mkdir(parents=True, exist_ok=True)
-    with _sole(place):
+    with sole_use(place / ".lock", "another process copies these tracks", patience_s=_PATIENCE_S):
         copy = _Copy(path, place)
         if (finished & ~copy.shards).any():
             copy.extend(finished)
@@ -252,19 +252,6 @@ def _made(status: NDArray[np.uint8]) -> Flags:
     """Tell which fits were made: neither does the window leave the frame, nor has the frame bad pixels."""
     made: Flags = (status & int(Status.OUTSIDE_FRAME | Status.BAD_FRAME)) == 0
     return made
-
-
-@contextmanager
-def _sole(place: Path) -> Iterator[None]:
-    """Hold the files against the other processes; the lock ends with the process, however that ends."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
-    with (place / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _tidy(folder: Path, kept: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from http import HTTPStatus
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -36,6 +37,7 @@ _ALWAYS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 _HSTS = "max-age=31536000"
+_TABLES = re.compile(r"/api/v1/jobs/[^/]*/columns(/refine|/lattice)?")
 
 
 class SecurityHeaders:
@@ -83,10 +85,18 @@ def host_name(host: str) -> str:
 
 
 class BodyLimit:
-    """Refuses requests whose body is larger than ``most`` bytes, whether they say so or send it in chunks."""
+    """Refuses requests whose body is too large, whether they say so or send it in chunks.
 
-    def __init__(self, app: ASGIApp, most: int) -> None:
-        self.app, self.most = app, most
+    Parameters
+    ----------
+    most
+        Bytes of a table of columns, which a process of the workshop reads.
+    small
+        Bytes of all others, which are read between other requests.
+    """
+
+    def __init__(self, app: ASGIApp, most: int, small: int = 1 << 20) -> None:
+        self.app, self.most, self.small = app, most, min(most, small)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, and count what it brings."""
@@ -94,20 +104,18 @@ class BodyLimit:
             await self.app(scope, receive, send)
             return
         said, came = Headers(scope=scope).get("content-length", ""), 0
-        if said.isdecimal() and int(said) > self.most:
-            await answer(TooLargeError(self._text))(scope, receive, send)
+        most = self.most if _TABLES.fullmatch(scope["path"]) else self.small
+        text = f"the body is larger than {most} bytes"
+        if said.isdecimal() and int(said[:20]) > most:
+            await answer(TooLargeError(text))(scope, receive, send)
             return
 
         async def counted() -> Message:
             nonlocal came
             message = await receive()
             came += len(message.get("body", b""))
-            if came > self.most:
-                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, self._text)  # the framework lets this one pass
+            if came > most:
+                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text)  # the framework lets this one pass
             return message
 
         await self.app(scope, counted, send)
-
-    @property
-    def _text(self) -> str:
-        return f"the body is larger than {self.most} bytes"

@@ -19,9 +19,9 @@ from . import rows
 from .clock import utc_now
 from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError
 from .states import CURATABLE, RETRYABLE, State
-from .tables import migrate
+from .tables import JobStoreError, check_place, migrate, store_error
 
-__all__ = ["ConflictError", "Job", "JobEvent", "JobStore", "UnknownJobError", "UnknownVersionError"]
+__all__ = ["ConflictError", "Job", "JobEvent", "JobStore", "JobStoreError", "UnknownJobError", "UnknownVersionError"]
 
 BUSY_TIMEOUT_S = 30.0
 KEPT_LINES = 2000
@@ -36,15 +36,19 @@ class JobStore:
 
     Raises
     ------
-    StoreError
-        Where the file was written by a newer version.
+    JobStoreError
+        Where the file was written by a newer version, is damaged or another program's, or cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         self._local = threading.local()
-        migrate(self.connection(), path)
+        check_place(path)
+        try:
+            migrate(self.connection(), path)
+        except sqlite3.Error as error:
+            raise store_error(path, error) from error
 
     def connection(self) -> sqlite3.Connection:
         """Return this thread's connection; it closes with the thread."""

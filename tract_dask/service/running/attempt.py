@@ -21,6 +21,7 @@ from typing import IO, Any
 from ...errors import ClusterError, TractError
 from ...io import FileList
 from ...settings import ClusterSettings, to_dict
+from ..data.crashes import crash_of, crashed
 from ..folders import DataRoot
 from ..jobs.clock import utc_now
 from ..jobs.states import State
@@ -82,7 +83,7 @@ def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stoppi
     Parameters
     ----------
     code
-        The exit code; negative for the signal that killed it.
+        The exit code; negative for the signal that killed it. One of a crash ends the job: it would crash again.
     cancel_reason
         Why somebody cancelled it; None where nobody did.
     stopping
@@ -99,6 +100,8 @@ def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stoppi
         return Ending(State.QUEUED, "the service was stopped")
     if said.error and not said.lost:
         return Ending(State.FAILED, said.error)
+    if not said.error and (sign := crash_of(code)):
+        return Ending(State.FAILED, str(crashed(job.source, sign)))
     return after_loss(job, said.error or f"the job's process {_death(code)}", progressed=said.shards > 0)
 
 

@@ -7,7 +7,7 @@ import sqlite3
 from contextlib import ExitStack
 from threading import Event, Thread
 
-from ... import stores
+from ...locks import sole_use
 from ..config import ServiceConfig
 from ..jobs.clock import utc_now
 from ..jobs.states import State
@@ -54,7 +54,7 @@ class Runner:
             Where another service works on the same data root.
         """
         lock = self._config.state / "service.lock"
-        self._held.enter_context(stores.sole_use(lock, "another service works on this data root", patience_s=5.0))
+        self._held.enter_context(sole_use(lock, "another service works on this data root", patience_s=5.0))
         self._stopping.clear()
         self._recover("the service had been killed")
         self.keeper.start()

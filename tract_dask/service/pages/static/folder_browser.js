@@ -13,7 +13,7 @@ const ICONS = {
 /** Shows `element` a folder at a time; `onMovie(path)` when a movie is chosen, `onFolder(path)` when a folder is opened. */
 export class FolderBrowser {
   constructor(element, { onMovie, onFolder }) {
-    Object.assign(this, { onMovie, onFolder, path: "", entries: [] });
+    Object.assign(this, { onMovie, onFolder, path: "", entries: [], next: null });
     this.crumbs = h("nav", { class: "crumbs", "aria-label": "Folder" });
     this.filter = h("input", { class: "input", type: "search", placeholder: "Filter by name", "aria-label": "Filter by name", autocomplete: "off", oninput: () => this.show() });
     this.body = h("tbody", {});
@@ -37,9 +37,9 @@ export class FolderBrowser {
     this.showCrumbs(path);
     const slow = setTimeout(() => this.note.replaceChildren(h("p", { class: "empty" }, "Reading the folder …")), 300);
     try {
-      const { entries } = await get("/files", { path });
+      const { entries, next } = await get("/files", { path });
       if (this.opening !== mine) return;
-      Object.assign(this, { path, entries });
+      Object.assign(this, { path, entries, next });
       this.filter.value = "";
       this.show();
       this.scroll.scrollTop = 0;
@@ -49,6 +49,20 @@ export class FolderBrowser {
       this.note.replaceChildren(h("div", { class: "empty" }, h("h2", {}, error.what), h("p", {}, error.remedy), path && h("button", { type: "button", class: "button", onclick: () => this.open("") }, "To the data root")));
     } finally {
       clearTimeout(slow);
+    }
+  }
+
+  /** Read the next page of the folder, and show it with those before. */
+  async more(event) {
+    const mine = this.opening;
+    event.target.disabled = true;
+    try {
+      const { entries, next } = await get("/files", { path: this.path, after: this.next });
+      if (this.opening !== mine) return;
+      Object.assign(this, { entries: [...this.entries, ...entries], next });
+      this.show();
+    } catch (error) {
+      if (this.opening === mine) event.target.replaceWith(h("p", { class: "empty" }, `${error.what}. ${error.remedy}`));
     }
   }
 
@@ -72,12 +86,16 @@ export class FolderBrowser {
     this.body.replaceChildren(...seen.map((entry) => this.row(entry)));
     const movies = seen.filter((entry) => entry.kind === "movie").length;
     const empty = wanted ? "Nothing here has this in its name." : "This folder is empty. Put a movie into it: TIFF, MRC, HDF5, .npy, raw, or a folder of images.";
-    this.note.replaceChildren(seen.length ? h("p", { class: "sr", "aria-live": "polite" }, `${several(seen.length, "entry", "entries")}, ${several(movies, "movie")}`) : h("p", { class: "empty" }, empty));
+    this.note.replaceChildren(seen.length ? h("p", { class: "sr", "aria-live": "polite" }, `${several(seen.length, "entry", "entries")}, ${several(movies, "movie")}`) : h("p", { class: "empty" }, this.next ? "None of those that were read so far." : empty),
+      this.next ? h("button", { type: "button", class: "button", onclick: (event) => this.more(event) }, `Show more than ${this.entries.length} entries`) : "");
   }
 
   row(entry) {
     const { kind } = entry;
     const choose = () => (kind === "folder" ? this.open(entry.path) : this.onMovie(entry.path));
+    if (kind === "unusable") {
+      return h("tr", { dataset: { kind } }, h("td", { class: "muted", title: "Its name is not UTF-8: rename it" }, icon("file"), h("span", {}, entry.name)), h("td", {}), h("td", {}));
+    }
     const title = kind === "file" ? `${entry.name}: no movie by its name; you can try` : entry.name;
     return h("tr", { dataset: { kind } },
       h("td", {}, h("button", { type: "button", class: "entry", title, onclick: choose, dataset: { path: entry.path } }, icon(kind), h("span", {}, entry.name))),
