@@ -12,7 +12,7 @@ GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"damage", "disk", "journal", "provenance", "shards", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
-RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
+RUN = STAGES | {"cluster", "dispatch", "stages", "pipeline", "tasks", "tls"}
 
 ALLOWED = {
     "errors": set(),
@@ -26,7 +26,10 @@ ALLOWED = {
     "damage": {"errors"},
     "shards": set(),
     "journal": {"disk", "errors", "shard_files", "shards", "stores"},
-    "tasks": {"errors", "journal", "shards"},
+    "tries": {"errors"},
+    "deaths": set(),
+    "dispatch": {"deaths", "errors", "journal", "shards", "tries"},
+    "tasks": {"dispatch", "errors", "journal", "progress", "shards", "tries"},
     "kernels": set(),
     "io": STORES,
     "shard_files": {"disk"},
@@ -56,23 +59,25 @@ ALLOWED = {
     "figures": MOVIE | {"analysis", "comparison", "dose", "plots", "results"},
     "simulate": GROUND | {"analysis", "kernels", "lazy", "seeds", "stores", "windows"},
     "tls": {"certificates", "errors"},
-    "slurm": {"errors", "forkserver", "settings", "tls"},
+    "slurm": {"deaths", "errors", "forkserver", "settings", "tls"},
     "supervision": set(),
-    "ssh": {"errors", "forkserver", "settings", "supervision", "tls"},
+    "ssh": {"deaths", "errors", "forkserver", "settings", "supervision", "tls"},
     "dask_dashboard": set(),
-    "cluster": {"dask_dashboard", "errors", "settings", "forkserver", "slurm", "ssh", "tasks", "tls"},
+    "cluster": {"dask_dashboard", "deaths", "dispatch", "errors", "settings", "forkserver", "slurm", "ssh", "tls"},
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
     "verify": STORES | {"conversion", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
-    "pipeline": STAGES | {"cluster", "report", "stages"},
+    "pipeline": STAGES | {"cluster", "report", "stages", "tls"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "editor": RUN | {"service"},
     "options": {"settings"},
     "console": {"options"},
+    "interrupts": set(),
+    "program": {"cli", "interrupts"},
     "certificates": {"errors"},
     "service": RUN
     | {"parts", "analysis", "certificates", "describe", "export", "forkserver", "lazy"}
@@ -84,7 +89,8 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal", "verify"},
+    | {"console", "editor", "hosting", "interrupts", "lazy", "options", "remote", "report", "simulate", "terminal"}
+    | {"verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

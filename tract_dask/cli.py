@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
+from . import interrupts
 from .console import DEBUG, PATH, Subgroup, common_options, show
 from .errors import TractError
 from .hosting import certs, serve, token
@@ -37,8 +38,8 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-FAILED, BAD_FRAMES, INTERRUPTED = 1, 3, 130
-"""Exit codes beside 0, and 2 for usage or bad input."""
+FAILED, BAD_FRAMES = 1, 3
+"""Exit codes beside 0, 2 for usage or bad input, and that of an interrupt."""
 
 
 class Group(click.Group):
@@ -56,8 +57,8 @@ class Group(click.Group):
             with _terminated_as_interrupted():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            click.echo("Interrupted: what is done is kept, and the same command goes on from there.", err=True)
-            ctx.exit(INTERRUPTED)
+            click.echo(interrupts.SENTENCE, err=True)
+            ctx.exit(interrupts.CODE)
         except (click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except TractError as error:
@@ -547,11 +548,14 @@ def command() -> NoReturn:
     To take apart all that was imported takes Python a second or more, and nothing depends on it: what was written is on
     disk, the workers are gone, and their server ends with this process.
     """
+    interrupts.install()
     code: object = 0
     try:
         main()
     except SystemExit as ended:
         code = ended.code
+    except KeyboardInterrupt:  # just before a command has begun, or after its end
+        interrupts.end_at_once()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # whoever read it may be gone
             stream.flush()

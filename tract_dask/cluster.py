@@ -27,6 +27,7 @@ from .tls import Credentials, checked_address, in_memory, security, temporary_cr
 PACKAGE = "tract_dask"
 
 _NANNY_ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
+_LOST_WORKER = "distributed.deploy.lost-worker-timeout"
 _PROCESS_METHOD = "distributed.worker.multiprocessing-method"
 
 _TOLD_OF_DEATHS = {"distributed.scheduler.allowed-failures": 0, "distributed.nanny.preload": [deaths.MODULE]}
@@ -234,7 +235,10 @@ def _hold_local(settings: ClusterSettings, credentials: Credentials | None) -> I
 
     What listens speaks TLS: the loopback is open to every user of the machine, and Dask runs what it is sent.
     """
-    changes: dict[str, Any] = {_NANNY_ENVIRONMENT: dict(dask.config.get(_NANNY_ENVIRONMENT)) | forkserver.ENVIRONMENT}
+    changes: dict[str, Any] = {
+        _NANNY_ENVIRONMENT: dict(dask.config.get(_NANNY_ENVIRONMENT)) | forkserver.ENVIRONMENT,
+        _LOST_WORKER: "1000 days",  # its nanny starts another; one that died twice in 15 s would not be replaced
+    }
     if forkserver.AVAILABLE:
         changes[_PROCESS_METHOD] = "forkserver"
     forkserver.start()

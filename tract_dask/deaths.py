@@ -6,18 +6,20 @@ of clusters that are started here do, or once a client has registered :class:`No
 
 from __future__ import annotations
 
+import asyncio
 import signal
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import Client
+from distributed import Client, Status
 from distributed.diagnostics.plugin import NannyPlugin
 
 MODULE = __name__
 """What nannies load."""
 
 _TOPIC, _MEMORY_TOPIC = "tract_dask-deaths", "worker-restart-memory"
+_ANSWER_S = 2.0
 _CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL}
 
 MOST_CRASHES, MOST_UNKNOWN = 2, 3
@@ -39,8 +41,8 @@ class Death:
 
     @property
     def is_of_node(self) -> bool:
-        """Whether its machine, or somebody, has ended it."""
-        return self.code is not None and not self.is_crash
+        """Whether its machine, or somebody, has ended it, whatever it was doing."""
+        return self.code is not None and not self.is_crash and not self.out_of_memory
 
     def __str__(self) -> str:
         if self.out_of_memory:
@@ -72,8 +74,10 @@ def dask_setup(nanny: Any) -> None:
     go_on = nanny._on_worker_exit
 
     async def note(code: int) -> None:
-        with suppress(Exception):  # to restart the worker is more important
-            nanny.log_event(_TOPIC, {"worker": nanny.worker_address, "code": code})
+        if nanny.status == Status.running:
+            record = {"worker": nanny.worker_address, "code": code}
+            with suppress(Exception):  # to restart the worker is more important
+                await asyncio.wait_for(nanny.scheduler.log_event(topic=_TOPIC, msg=record), _ANSWER_S)
         await go_on(code)
 
     nanny._on_worker_exit = note

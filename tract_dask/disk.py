@@ -11,6 +11,7 @@ import ctypes
 import errno
 import os
 from collections.abc import Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
@@ -19,6 +20,9 @@ from typing import Any, NamedTuple
 
 _WRITE_BACK = 2
 """SYNC_FILE_RANGE_WRITE: start writing, and do not wait."""
+
+_AT_ONCE = 16
+"""So many files are synced at a time."""
 
 _NO_SYNC = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
 """What file systems say that cannot sync."""
@@ -50,8 +54,7 @@ class Batch:
 
     def commit(self) -> None:
         """Sync all that is kept, then put it in place."""
-        for now in dict.fromkeys(now for now, _ in self._ready):
-            sync(now)
+        sync_all({now for now, _ in self._ready})
         for now, written in self._ready:
             if now != written.path:
                 now.replace(written.path)
@@ -102,23 +105,17 @@ def place_now(aside: Path, path: Path) -> None:
 def place_folder(aside: Path, path: Path) -> None:
     """Put a folder of small files in its place, where there is none: every file synced, then the folder renamed."""
     files = [Path(folder, name) for folder, _, names in os.walk(aside) for name in names]
-    for file in files:
-        with file.open("rb") as opened:
-            write_back(opened.fileno(), 0, 0)
-    for file in files:
-        sync(file)
-    for folder, _, _ in os.walk(aside):
-        sync(Path(folder))
+    sync_all(files)
+    sync_all([Path(folder) for folder, _, _ in os.walk(aside)])
     aside.replace(path)
     sync(path.parent)
 
 
 def sync_folders(store: Path, small: Collection[str] = ()) -> None:
     """Sync the names in every folder of a store, and the files of its ``small`` arrays, before it is complete."""
-    for folder, _, names in os.walk(store):
-        for name in names if Path(folder).name in small else ():
-            sync(Path(folder, name))
-        sync(Path(folder))
+    walked = [(Path(folder), names) for folder, _, names in os.walk(store)]
+    sync_all([folder / name for folder, names in walked if folder.name in small for name in names])
+    sync_all([folder for folder, _ in walked])
 
 
 def append(path: Path, data: bytes) -> None:
@@ -133,6 +130,16 @@ def append(path: Path, data: bytes) -> None:
         sync(path)
     else:
         batch.add(path, Written(path, end))
+
+
+def sync_all(paths: Collection[Path]) -> None:
+    """Sync files or folders at the same time: the disk then writes its own journal once for many of them."""
+    if len(paths) <= 1:
+        for path in paths:
+            sync(path)
+        return
+    with ThreadPoolExecutor(min(len(paths), _AT_ONCE), "sync") as pool:
+        list(pool.map(sync, paths))
 
 
 def sync(path: Path) -> None:

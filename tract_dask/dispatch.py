@@ -360,26 +360,26 @@ class Dispatch:
         self._tell_once(how, f"worker {worker} died ({how}); what it was doing is done again")
         if batch.copies:
             return
-        if how.is_of_node or not (how.is_crash or batch.is_suspect or batch.lost):
+        if how.is_of_node or not (how.is_crash or how.out_of_memory or batch.is_suspect or batch.lost):
             batch.lost.append(how)
-            self._check_lost(batch, how)
-            self._send(batch)
+            self._check_lost(batch.lost, _MOST_LOST, batch)
+            (self._suspects.append if batch.is_suspect else self._send)(batch)
         elif not batch.is_suspect:
             self._suspects += batch.split(is_suspect=True)
         else:
             batch.deaths.append(how)
+            self._check_lost([met for met in batch.deaths if met.out_of_memory], _MOST_SWOLLEN, batch)
             if is_to_blame(batch.deaths, others_finished=self._finished > 0):
                 raise self._crash(batch, how)
             self._suspects.append(batch)
 
-    def _check_lost(self, batch: Batch, how: Death) -> None:
+    def _check_lost(self, lost: list[Death], most: int, batch: Batch) -> None:
         """Give up a batch that loses one worker after the other, though not by its data."""
-        swollen = sum(met.out_of_memory for met in batch.lost)
-        if swollen >= _MOST_SWOLLEN or len(batch.lost) >= _MOST_LOST:
+        if len(lost) >= most:
             raise ClusterError(
                 f"workers died again and again under {self._frames(batch)} in stage {self._name}",
-                how.worker,
-                got=str(how),
+                lost[-1].worker,
+                got=str(lost[-1]),
                 remedy="Give them more memory (--memory-limit) or make shards smaller (--shard-mb), and run again",
             )
 

@@ -12,7 +12,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 
 AVAILABLE = sys.platform == "linux" and sys.version_info >= (3, 11, 1)
 """Elsewhere workers are spawned: Windows cannot fork, and on macOS system libraries do not survive it.
@@ -54,6 +54,7 @@ def start() -> None:
     """
     if AVAILABLE:
         multiprocessing.set_forkserver_preload(_PRELOAD)
+        resource_tracker.ensure_running()  # which the server would start, and which hears nothing by itself
         with _environment(), _deaf():
             forkserver.ensure_running()
 

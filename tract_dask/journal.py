@@ -143,7 +143,7 @@ class Journal:
                 f"run {self.path.name}",
                 f"run {_current(self.folder)[1]}" if _current(self.folder)[1] else "none: the run is over",
                 "Go on with the newer run: it does all shards itself",
-            )
+            ) from None
 
     @contextmanager
     def batch(self) -> Iterator[Callable[[Shard, Payload], None]]:

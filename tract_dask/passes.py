@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import tempfile
 import uuid
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from .errors import StoreError
 from .journal import Fields, Journal, Payload
 from .movie import Movie
 from .progress import ShardDone, Sink, StageDone, StageStarted
-from .shard_files import CHECKSUM_BYTES, checksum, crc32c
+from .shard_files import checksum, unchecked
 from .shards import Shard
-from .stores import disk_errors, load_array
+from .stores import disk_errors, sole_parser
 from .tasks import run_shards
 
 
@@ -79,14 +79,14 @@ class Passes:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as .npy, and behind it a checksum: beside its place first, then synced and renamed."""
-    array = np.ascontiguousarray(array)
+    """Write an array as .npy, and behind it a checksum of all: beside its place first, then synced and renamed."""
+    data = io.BytesIO()
+    np.save(data, array)
     aside = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.partial")
     with disk_errors(path):
         try:
             with aside.open("wb") as file:
-                np.save(file, array)
-                file.write(_checksum(array))
+                file.writelines((data.getbuffer(), checksum(data.getbuffer())))
             disk.place(aside, path)
         except BaseException:
             aside.unlink(missing_ok=True)
@@ -102,24 +102,15 @@ def load_saved(path: Path) -> NDArray[Any]:
         Where it is missing, or damaged.
     """
     try:
-        array = load_array(path)
-        with path.open("rb") as file:
-            file.seek(-CHECKSUM_BYTES, os.SEEK_END)
-            good = file.read() == _checksum(array)
-    except (FileNotFoundError, EOFError, ValueError):
-        good = False
-    if not good:
+        data = unchecked(memoryview(path.read_bytes()))
+    except (FileNotFoundError, ValueError) as error:
         raise StoreError(
             "what a task of this stage left is missing, or damaged",
             str(path),
             "an array with its checksum",
-            "no file" if not path.exists() else "other bytes",
+            str(error),
             "Delete this file and run again: it is made anew",
-        )
+        ) from error
+    with sole_parser():
+        array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     return array
-
-
-def _checksum(array: NDArray[Any]) -> bytes:
-    """Return the CRC-32C of an array's values, shape and type."""
-    told = repr((array.dtype.str, array.shape)).encode()
-    return checksum(crc32c(array).to_bytes(CHECKSUM_BYTES, "little") + told)

@@ -43,6 +43,7 @@ from .seeds import read_columns_csv
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import split
 from .stages import columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
+from .tls import open_to_others
 from .windows import check_window
 
 WORKER_BYTES = 300_000_000
@@ -443,6 +444,7 @@ class _Session:
         plan: Plan | None = None,
     ) -> None:
         self._started, self._plan, self._began = RunStarted(source, str(output)), plan, perf_counter()
+        self._is_given = client is not None
         self.workers, self.send = LazyClient(cluster, client, self._on_connect), send
         self.state, self.message = "done", ""
         self._thread, self._asides = ThreadPoolExecutor(1, "aside"), list[Future[object]]()
@@ -473,6 +475,8 @@ class _Session:
         if self._plan:
             dataclasses.replace(self._plan, memory_limit=memory_budget(client)).check()
         self.send(dataclasses.replace(self._started, dashboard=client.dashboard_link or ""))
+        if not self._is_given and (warning := open_to_others(client.scheduler.address)):
+            self.send(Warned(warning))
         self.aside(_get_ready)
 
 

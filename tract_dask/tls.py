@@ -146,3 +146,19 @@ def checked_address(address: str, folder: str | None) -> str:
             "Start scheduler and workers with the certificates (docs/deploy.md), or leave them out",
         )
     return address
+
+
+def open_to_others(address: str) -> str:
+    """Return a warning where a scheduler takes what everybody sends it; empty where it demands certificates.
+
+    Examples
+    --------
+    >>> open_to_others("tls://10.0.0.1:8786")
+    ''
+    """
+    if not address.startswith("tcp://"):
+        return ""
+    return (
+        f"whoever reaches {address} can run code as you: this cluster speaks without TLS. Make certificates with "
+        "tract-dask certs DIR, start scheduler and workers with them, and give them to the run with --tls DIR"
+    )
