@@ -19,10 +19,13 @@ from distributed import Client, LocalCluster
 from tract_dask import pipeline, stores
 from tract_dask.cli import main
 from tract_dask.errors import MissingStoreError, StoreError
+from tract_dask.journal import Journal, journal_beside
 from tract_dask.movie import open_movie
+from tract_dask.parts import SHARDED, write
 from tract_dask.progress import StageDone
 from tract_dask.results import open_results
 from tract_dask.settings import ConvertSettings, RunSettings
+from tract_dask.shards import split
 from tract_dask.verify import verify
 
 SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1, tile_px=64))
@@ -381,6 +384,26 @@ def test_verify_takes_an_unfinished_store_for_what_it_is(copy):
     assert found.unfinished == (copy / "movie.zarr",)
     (copy / "movie.zarr" / "0" / "c.1.0.0").write_bytes(b"")
     assert not verify(copy / "movie.zarr").sound
+
+
+def test_verify_reads_the_parts_of_a_fit_that_is_not_finished(copy):
+    store = copy / "results.zarr"
+    tracks, step = open_results(store).load(), open_movie(copy / "movie.zarr").frames_per_shard
+    stores.update_attributes(store, complete=False)
+    journal = Journal(journal_beside(store), stores.attributes(store)["key"])
+    for shard in split(tracks.sizes["frame"], step)[:2]:
+        values = {name: tracks[name].to_numpy()[shard.start : shard.stop] for name in SHARDED}
+        with journal.batch() as done:
+            write(journal.path, shard, values, step)
+            done(shard, {})
+    assert verify(store).sound
+    (part,) = journal.path.glob("*.parts")
+    data = bytearray(part.read_bytes())
+    data[40] ^= 1
+    part.write_bytes(data)
+    (fault,) = (found := verify(store)).faults
+    assert (fault.file, fault.what, fault.frames) == (journal.path, "damaged", (0, step))  # a short part
+    assert found.remedies == ["Run the same command again: it makes anew what is damaged"]
 
 
 def test_verify_says_where_there_is_nothing(tmp_path):

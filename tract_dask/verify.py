@@ -18,7 +18,7 @@ from . import stores
 from .conversion import remake
 from .damage import FRAME_AXES, METADATA, remedy
 from .errors import MissingStoreError, StoreError
-from .journal import Journal, journal_beside
+from .journal import Journal, entries, journal_beside
 from .locks import sole_use
 from .parts import SHARDED, Parts, layout
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
@@ -230,8 +230,13 @@ def _damaged_parts(store: Path, key: str) -> list[Fault]:
         return []
     n_frames, step, _ = layout(store)
     parts, faults = Parts.of(journal, n_frames, step), []
-    for index in np.flatnonzero(parts.done).tolist():
-        fault = Fault(parts.file(index), store, "fit", "damaged", "", (index * step, min(n_frames, (index + 1) * step)))
+    for index in sorted({index for index, _ in entries(journal.folder) if index < len(parts.done)}):
+        frames = (index * step, min(n_frames, (index + 1) * step))
+        if not parts.done[index]:
+            why = "not as its line in the journal says"
+            faults.append(Fault(journal.path, store, "fit", "damaged", why, frames))
+            continue
+        fault = Fault(parts.file(index), store, "fit", "damaged", "", frames)
         try:
             for name in SHARDED:
                 parts.stored(index, name)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from .. import stores
-from ..errors import DestinationError, InputError, MissingStoreError
+from ..errors import DestinationError, InputError, MissingStoreError, StoreError
 from ..io import READERS, FileList, list_files, unknown_format
 from ..io.listing import WILD
 
@@ -363,7 +363,10 @@ def _kind(place: Path, is_folder: bool) -> str:
     if is_folder and place.suffix.lower() != ".zarr":
         return "folder"
     if is_folder:
-        return "movie" if stores.attributes(place).get("kind") == "movie" else "file"
+        try:
+            return "movie" if stores.attributes(place).get("kind") == "movie" else "file"
+        except StoreError:  # a damaged store does not keep others from being listed
+            return "file"
     return "movie" if place.suffix.lower() in READERS else "file"
 
 
