@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ class MemoryMovie:
     gain: float = 1.0
     pixel_size_pm: float | None = 10.0
     key: str = "key"
+    path: Path = Path("memory")
     tile: tuple[int, int, int] = (16, 256, 256)
     reads: list[int] = field(default_factory=list)
 
