@@ -155,7 +155,7 @@ def wait_s(tries: int) -> float:
     [1.0, 2.0, 4.0, 16.0]
     """
     first = float(dask.config.get(RETRY, _RETRY_S))
-    return first * min(2 ** (tries - 1), _LONGEST_WAIT)
+    return first * float(min(2 ** (tries - 1), _LONGEST_WAIT))
 
 
 def is_hopeless(troubles: Sequence[Trouble], workers: Collection[str]) -> bool:
