@@ -147,7 +147,7 @@ def sick_worker(folder: Path, shard: Shard) -> dict[str, int]:
 def test_a_worker_that_always_fails_is_left_out(run, tmp_path):
     told = run(sick_worker, count=120)
     assert any("is left out" in text for text in told)
-    assert (tmp_path / "tries").stat().st_size < 20
+    assert (tmp_path / "tries").stat().st_size < 60
 
 
 def test_what_an_error_is_told_from():
@@ -311,7 +311,7 @@ def test_a_worker_that_hangs_is_named_and_its_work_done_by_another(run, monkeypa
     monkeypatch.setattr(dispatch, "SLOW", 3)
     began = time.monotonic()
     told = run(task)
-    assert time.monotonic() - began < 15
+    assert time.monotonic() - began < 45, "it sleeps for a minute"
     assert any(f"has been {how} for" in text and "127.0.0.1" in text and "movie.tif" in text for text in told)
 
 
@@ -335,7 +335,7 @@ def test_a_cluster_ends_in_time_though_its_worker_is_stopped():
         (pid,) = client.run(os.getpid).values()
         os.kill(pid, signal.SIGSTOP)
         began = time.monotonic()
-    assert time.monotonic() - began < 15
+    assert time.monotonic() - began < 30
 
 
 def test_a_cluster_of_others_begins_to_tell_how_workers_die():
