@@ -99,6 +99,8 @@ def queue(store: JobStore, **more):
 class NoCluster:
     """A keeper whose cluster is there but for the first ``absent`` times that it is asked for."""
 
+    credentials = None
+
     def __init__(self, absent: int = 0) -> None:
         self.absent = absent
 

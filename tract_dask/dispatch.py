@@ -240,7 +240,8 @@ class Dispatch:
         """Give each worker that has none a shard that is to be tried alone."""
         if not self._suspects:
             return
-        testing = set().union(*(batch.copies.values() for batch in self._flying.values() if batch.is_suspect))
+        bounds = (bound for batch in self._flying.values() if batch.is_suspect for bound in batch.copies.values())
+        testing: set[str] = set().union(*bounds)
         for worker in self._healthy() - testing:
             before = (k for k, batch in enumerate(self._suspects) if worker not in {d.worker for d in batch.deaths})
             if self._suspects:
@@ -257,7 +258,7 @@ class Dispatch:
         workers = set(self._crew.workers)
         healthy = self._healthy()
         chosen = set(only) or healthy - places_to_avoid(batch.troubles, healthy) or healthy
-        bound = frozenset() if chosen == workers else frozenset(chosen)
+        bound = frozenset() if chosen == workers and not only else frozenset(chosen)
         self._sent += 1
         key = (self._group, int(batch.shards[0]), self._sent)
         where = {"workers": sorted(bound)} if bound else {}

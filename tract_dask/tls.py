@@ -159,6 +159,6 @@ def open_to_others(address: str) -> str:
     if not address.startswith("tcp://"):
         return ""
     return (
-        f"whoever reaches {address} can run code as you: this cluster speaks without TLS. Make certificates with "
+        f"everyone who reaches {address} can run code as you: this cluster speaks without TLS. Make certificates with "
         "tract-dask certs DIR, start scheduler and workers with them, and give them to the run with --tls DIR"
     )

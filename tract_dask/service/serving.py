@@ -218,7 +218,7 @@ def check_traffic(config: ServiceConfig) -> list[str]:
         return []
     if config.needs_tokens:
         raise InputError(
-            "tokens would keep nobody out: whoever reaches this cluster can run code on it",
+            "tokens would keep nobody out: everyone who reaches this cluster can run code on it",
             f"cluster of kind {cluster.resolved_kind}",
             "a cluster with TLS",
             "one without",
