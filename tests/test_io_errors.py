@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import struct
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import h5py
 import mrcfile
@@ -15,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_io import N_FRAMES, N_X, N_Y, UNDECLARED, movie
 
-from tract_dask.errors import SettingsError, SourceError
-from tract_dask.io import open_source
+from tract_dask.errors import SettingsError, SourceError, TractError
+from tract_dask.io import READERS, open_source
 from tract_dask.settings import SourceSettings
 
 
@@ -329,3 +331,188 @@ def damaged(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     with mrcfile.new(folder / "movie.mrc", data=frames):
         pass
     return {path.name: path for path in folder.iterdir()}
+
+
+def npy_of(header: bytes, version: int = 2) -> bytes:
+    return b"\x93NUMPY" + bytes((version, 0)) + len(header).to_bytes(4 if version > 1 else 2, "little") + header
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'",
+        npy_of(b"-" * 9000 + b"1"),
+        npy_of(b"(" * 9000),
+        npy_of(b"{'descr': '<u2', 'fortran_order': False, 'shape': (9" + b"9" * 4500 + b", 4, 4), }"),
+        npy_of(b"{'descr': '<u2', 'fortran_order': True, 'shape': (9" + b"9" * 400 + b", 4, 4), }", 1),
+        npy_of(b"{'descr': '<u9', 'fortran_order': True, 'shape': (1, 4, 4), }", 3),
+        npy_of(b"{'descr': '|V99999999999', 'fortran_order': False, 'shape': (1, 4, 4), }"),
+    ],
+)
+def test_npy_headers_that_claim_too_much(data: bytes, tmp_path: Path) -> None:
+    (tmp_path / "movie.npy").write_bytes(data)
+    fails(tmp_path / "movie.npy")
+
+
+OME_HEAD = '<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image><Pixels SizeT="{}">'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"ImageJ=1.53t\nimages={10**9}\nframes={10**9}\n", "ends in frame"),
+        (f"ImageJ=1.53t\nimages={10**15}\nframes={10**15}\n", "makes no sense"),
+        ("ImageJ=1.53t\nimages=" + "9" * 5000, "cannot be read"),
+        ('{"shape": ' + "[" * 50_000, ""),
+        (f'{{"shape": [{10**9}, 24, 37], "truncated": true}}', "ends in frame"),
+        (OME_HEAD.format(10**9) + "</Pixels></Image></OME>", "ends before its last page"),
+        (OME_HEAD.format(1) + '<TiffData PlaneCount="5"/>' * 100 + "</Pixels></Image></OME>", "again and again"),
+        ("<!DOCTYPE x [" + '<!ENTITY a "aaaaaaaa">' + "]>" + OME_HEAD.format(5) + "&a;</OME>", "declaration of types"),
+        ("<a>" * 100_000 + "</OME>", "OME description is damaged"),
+    ],
+)
+def test_tiff_descriptions_that_claim_too_much(text: str, words: str, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "movie.tif", movie()[0], description=text.encode(), metadata=None)
+    if words:
+        fails(tmp_path / "movie.tif", words)
+    else:
+        assert open_source(tmp_path / "movie.tif").shape == (1, N_Y, N_X)
+
+
+def patched(path: Path, tag: int, value: int) -> None:
+    """Change a tag of the first page of a little-endian classic TIFF."""
+    data = bytearray(path.read_bytes())
+    at = data.index(tag.to_bytes(2, "little"), int.from_bytes(data[4:8], "little"))
+    data[at + 2 : at + 12] = b"\x04\x00\x01\x00\x00\x00" + value.to_bytes(4, "little")
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("tags", "options", "words"),
+    [
+        ({256: 10**5, 257: 10**5, 278: 10**5}, {"compression": "zlib"}, "far larger than the file can hold"),
+        ({322: 1 << 20, 323: 1 << 20}, {"compression": "zlib", "tile": (16, 16)}, "far larger than the page"),
+        ({256: 2**31, 257: 2**31}, {}, "ends inside the data of page 0"),
+        ({278: 1}, {"compression": "zlib"}, "does not say where its pixels are"),
+        ({259: 22610}, {"compression": "zlib"}, "compression of page 0"),
+    ],
+)
+def test_tiff_pages_that_claim_too_much(
+    tags: dict[int, int], options: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "movie.tif"
+    tifffile.imwrite(path, movie()[0], metadata=None, **options)
+    for tag, value in tags.items():
+        patched(path, tag, value)
+    fails(path, words)
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "jpeg2000", "png", "lerc", "jpegxl", "webp"])
+def test_an_image_in_a_page_that_claims_too_much(codec: str, tmp_path: Path) -> None:
+    """The page is small; the image in its place, which the codec would believe, is not."""
+    import imagecodecs
+
+    path, large = tmp_path / "movie.tif", np.zeros((4200, 4200), "u1")
+    encode = getattr(imagecodecs, f"{ {'jpeg2000': 'jpeg2k'}.get(codec, codec) }_encode")
+    easy = {"effort": 1} if codec == "jpegxl" else {}
+    bomb = bytes(encode(np.dstack([large] * 3) if codec == "webp" else large, **easy))
+    tifffile.imwrite(path, movie("u1")[0], metadata=None, compression="lerc", photometric="minisblack")
+    data = bytearray(path.read_bytes())
+    path.write_bytes(data + bomb)
+    numbers = {"jpeg": 7, "jpeg2000": 34712, "png": 34933, "lerc": 34887, "jpegxl": 50002, "webp": 50001}
+    for tag, value in {259: numbers[codec], 273: len(data), 279: len(bomb)}.items():
+        patched(path, tag, value)
+    source = open_source(path)
+    with pytest.raises(SourceError, match=r"an image inside page 0 .* is far larger than the page"):
+        source.read(0, 1)
+
+
+def test_tiff_directories_that_overlap(tmp_path: Path) -> None:
+    """A thousand directories in each other's entries: to read them all would take for ever."""
+    path = tmp_path / "movie.tif"
+    tifffile.imwrite(path, movie()[0], metadata=None)
+    data = bytearray(path.read_bytes())
+    first = int.from_bytes(data[4:8], "little")
+    count = int.from_bytes(data[first : first + 2], "little")
+    tags = bytes(data[first + 2 : first + 2 + 12 * count])
+    n_pages, n_entries = 2000, 3000
+    start = len(data) + len(data) % 2
+    body = bytearray(bytes(start - len(data)))
+    for k in range(n_pages):
+        after = start + 4 * (k + 1) if k < n_pages - 1 else 0
+        body += n_entries.to_bytes(2, "little") + after.to_bytes(2, "little")
+    data[4:8] = start.to_bytes(4, "little")
+    path.write_bytes(data + body + tags * 4000)
+    fails(path)
+
+
+def test_hdf5_that_claims_too_much(tmp_path: Path) -> None:
+    path = tmp_path / "movie.h5"
+    with h5py.File(path, "w") as file:
+        wide = file.create_dataset("wide", (2, 1 << 20, 1 << 20), "u2", chunks=(1, 64, 64), compression="gzip")
+        wide[0, :64, :64] = 1
+        chunk = file.create_dataset("chunk", (64, 2048, 1024), "u1", chunks=(64, 1024, 1024), compression="gzip")
+        chunk[0, 0, 0] = 1
+        long = file.create_dataset("long", (1 << 40, 8, 8), "u1", chunks=(1, 8, 8), compression="gzip")
+        long[0] = 1
+        file["text"] = "not a movie"
+        file["nothing"] = h5py.Empty("u2")
+    fails(f"{path}::wide", "one frame would be far larger than the file can hold")
+    fails(f"{path}::chunk", "one chunk would be far larger than the file can hold")
+    fails(f"{path}::long", "the number of frames makes no sense")
+    fails(f"{path}::text", "cannot be used as intensities")
+    fails(f"{path}::nothing", "not a movie")
+
+
+def test_hdf5_with_more_objects_than_are_looked_at(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "movie.h5", "w", libver="latest") as file:
+        file["data"] = movie()
+        for k in range(10_001):
+            file[f"many/{k}"] = h5py.SoftLink("/data")
+    fails(tmp_path / "movie.h5", "more than 10,000", "movie.h5::/entry/data")
+    assert open_source(f"{tmp_path / 'movie.h5'}::many/7").shape == movie().shape
+
+
+def test_mrc_headers_that_claim_too_much(tmp_path: Path) -> None:
+    header = np.zeros(256, "<i4")
+    for shape, extended in (((2**31 - 1, 2**31 - 1, 2**31 - 1), 0), ((4, 4, 4), 2**31 - 1), ((4, 4, 2**30), 0)):
+        header[:4], header[23] = (*shape, 6), extended
+        (tmp_path / "movie.mrc").write_bytes(header.tobytes() + bytes(128))
+        fails(tmp_path / "movie.mrc", "the file ends")
+    source_settings = SourceSettings((2**40, 2**20, 2**20), "u2")
+    (tmp_path / "movie.raw").write_bytes(bytes(100))
+    fails(tmp_path / "movie.raw", "makes no sense", declared=source_settings)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [RecursionError("deep"), KeyError("name"), OverflowError("big"), ZeroDivisionError(), struct.error("short")],
+)
+def test_whatever_a_library_raises_is_an_error_of_ours(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tifffile.imwrite(tmp_path / "movie.tif", movie(), compression="zlib")
+    source = open_source(tmp_path / "movie.tif")
+
+    def broken(*arguments: object, **options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(tifffile, "TiffPage", broken)
+    with pytest.raises(SourceError, match=r"movie\.tif") as caught:
+        source.read(0, 1)
+    assert caught.value.__cause__ is error
+    monkeypatch.setitem(READERS, ".tif", broken)
+    fails(tmp_path / "movie.tif")
+
+
+def test_too_little_memory_is_not_the_files_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.save(tmp_path / "movie.npy", movie())
+    source = open_source(tmp_path / "movie.npy")
+
+    def full(*arguments: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("tract_dask.io.blocks.fill_from", full)
+    with pytest.raises(TractError, match=r"memory ran out.*fewer workers") as caught:
+        source.read(0, 1)
+    assert not isinstance(caught.value, SourceError)

@@ -25,7 +25,7 @@ from tract_dask.service.entrance.login import login
 from tract_dask.service.jobs.states import State
 from tract_dask.service.pages import pages
 from tract_dask.service.refusals import ForbiddenError, TooManyError
-from tract_dask.settings import ClusterSettings
+from tract_dask.settings import ClusterSettings, SshSettings
 
 HERE = "http://localhost:8000"
 ERROR_PARTS = {"what", "where", "expected", "got", "remedy", "text", "kind"}
@@ -226,11 +226,11 @@ def test_who_guesses_has_to_wait(client, tokens, monkeypatch):
     for address in ("b", "c"):
         attempts.failed(address)
     attempts.check("testclient")  # only so many addresses are remembered
-    quick = Attempts(limit=1, window_s=0.01)
+    quick = Attempts(limit=1, window_s=0.5)
     quick.failed("a")
     with pytest.raises(TooManyError):
         quick.check("a")
-    time.sleep(0.02)
+    time.sleep(0.6)
     quick.check("a")
 
 
@@ -578,6 +578,15 @@ def test_serve_warns_of_what_is_not_encrypted(tmp_path):
     assert notes() == notes(ClusterSettings(scheduler="tcp://127.0.0.1:8786")) == ""
     assert "--tls" in notes(ClusterSettings(scheduler="tcp://10.0.0.5:8786"))
     assert notes(ClusterSettings(scheduler="tls://10.0.0.5:8786", tls="certificates")) == ""
+    for open_to_all in (
+        ClusterSettings(scheduler="tcp://127.0.0.1:8786"),
+        ClusterSettings(scheduler_file="scheduler.json"),
+        ClusterSettings(kind="ssh", ssh=SshSettings(hosts=("node1",))),
+    ):
+        with pytest.raises(InputError, match="tokens would keep nobody out") as caught:
+            notes(open_to_all, tokens=True)
+        assert "--tls" in caught.value.remedy
+    assert notes(ClusterSettings(kind="local"), tokens=True) == ""
     assert "unencrypted" in notes(host="0.0.0.0")
     make_certificates(tmp_path / "certs")
     assert notes(host="0.0.0.0", certificates=tmp_path / "certs") == ""

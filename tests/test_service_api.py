@@ -336,7 +336,7 @@ class Listener:
         self.ended.set()
 
     def wait_for(self, count: int) -> list:
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while len(self.events) < count and time.monotonic() < deadline:
             time.sleep(0.01)
         assert len(self.events) >= count, self.events
@@ -358,7 +358,8 @@ def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
         store.log(other["id"], "info", "of another job")
         for k in range(5):
             store.progress(first["id"], {"stage": "fit", "done_frames": k})
-            time.sleep(0.25)  # only the newest is kept: let each be seen
+            listener.wait_for(3 + k)  # only the newest is kept: let each be seen
+            everything.wait_for(5 + k)
         store.log(first["id"], "info", "line\nwith an end")
         seen = listener.wait_for(8)[1:]
         assert [kind for _, kind, _ in seen] == ["job", *["progress"] * 5, "log"]
@@ -382,8 +383,8 @@ def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
         assert resumed.wait_for(5)[-1][1:] == ("job", {"id": first["id"], "deleted": True})
         began = time.monotonic()
         app.state.feed.close()
-        assert all(one.ended.wait(2) for one in (listener, everything, resumed, stranger))
-        assert time.monotonic() - began < 1.5
+        assert all(one.ended.wait(10) for one in (listener, everything, resumed, stranger))
+        assert time.monotonic() - began < 10  # not with the next heartbeat
 
 
 def test_a_stream_of_a_revoked_token_ends(root):

@@ -469,6 +469,7 @@ def test_a_process_ends_with_its_standard_input(whole, client):
         "mark": {"owner": "ana", "job": "3f9a0c12de", "output": "cut_short"},
         "settings": SETTINGS,
         "cluster": {"scheduler": client.scheduler.address},
+        "credentials": None,
         "columns": None,
         "until": None,
         "stages": {},

@@ -10,13 +10,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
 from ..errors import SourceError
 from ..settings import MetadataSettings, SourceSettings
 from .hdf5 import open_hdf5
-from .listing import FileList, list_files
+from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
@@ -97,7 +98,7 @@ def open_source(
         Where a raw file is not, or wrongly, declared.
     """
     place = path if isinstance(path, FileList) else str(path) if isinstance(path, str | Path) else list(map(str, path))
-    name = next(iter(place), "") if isinstance(place, list) else str(place)
+    name = next(iter(place), "an empty list") if isinstance(place, list) else str(place)
     with reading(name):
         source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
     known = source.metadata
@@ -155,19 +156,24 @@ def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None
     inside = {inner for _, inner in split}
     if len(inside) > 1:
         raise SourceError(
-            "the files of a list have different paths inside", names[0], "one path", ", ".join(sorted(inside)[:9])
+            "the files of a list have different paths inside",
+            names[0],
+            "one path",
+            ", ".join(repr(path) for path in sorted(inside)[:9]),
+            "Name the same data set in each of them",
         )
     open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
-    return open_sequence(names[0] if names else "an empty list", [Path(outer) for outer, _ in split], open_file)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
 
 
 def _split(name: str) -> tuple[str, str]:
     """Return the path of a file, and the path inside it after two colons; a file whose name has colons is that file."""
-    places = [match.start() for match in re.finditer("::", name)]
-    for place in (len(name), *reversed(places)):
-        if os.path.lexists(name[:place]):
-            return name[:place], name[place + 2 :]
-    return name.partition("::")[0], name.partition("::")[2]
+    ends = [match.start() for match in re.finditer("::", name)]
+    there = [end for end in (len(name), *reversed(ends)) if os.path.lexists(name[:end])]
+    files = (end for end in there if not name[:end].endswith("/"))
+    fitting = (end for end in (*ends, len(name)) if is_pattern(Path(name[:end])))
+    end = next(chain(files, fitting, there), ends[0] if ends else len(name))
+    return name[:end], name[end + 2 :]
 
 
 def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:

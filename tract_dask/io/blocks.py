@@ -52,6 +52,7 @@ class BlockSource(Source):
         """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
         with reading(self.path, f"the file cannot be read at frames {start} to {start + len(frames) - 1}"):
             self._fill(start, frames)
+        self._check_exact(start, frames)
 
     def _fill(self, start: int, frames: Frames) -> None:
         if self.stored.newbyteorder("=") == self.dtype:

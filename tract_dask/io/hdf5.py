@@ -122,6 +122,7 @@ def open_hdf5(path: Path, inner: str, settings: SourceSettings, *, permit: Permi
             "shape": shape,
             "dtype": dtype,
             "metadata": replace(metadata, notes=metadata.notes + notes),
+            "inside": dataset.name,
         }
         if dataset.id.get_create_plist().get_external_count():
             return RawPixelSource(**common, segments=tuple(behind.raw), stored=_stored(dataset, where))
@@ -131,7 +132,7 @@ def open_hdf5(path: Path, inner: str, settings: SourceSettings, *, permit: Permi
 
 def _stored(dataset: Any, where: str) -> np.dtype[Any]:
     """Return the type in which raw pixels are read without HDF5, which has to be one that NumPy knows."""
-    stored = dataset.dtype
+    stored: np.dtype[Any] = dataset.dtype
     if h5py.h5t.py_create(stored) != dataset.id.get_type():
         raise SourceError(
             "the raw pixels are of a type that only HDF5 knows",
@@ -161,14 +162,15 @@ def _chosen(file: Any, inner: str, path: Path, access: Access) -> tuple[str, tup
 def _ambiguous(
     path: Path, inner: str, target: Any, movies: list[Found], found: list[Found], lost: list[str]
 ) -> SourceError:
-    listing = [f"{item.shown} {item.shape} {item.dtype}" for item in found[:20]] + lost[:20]
+    listing = ", ".join(f"{item.shown} {item.shape} {item.dtype}" for item in found[:20])
+    holds = f"a file that holds {listing}" if listing else "a file without data sets"
     return SourceError(
         "there is nothing under this path"
         if target is None
-        else f"there are {len(movies)} data sets that could be the movie",
+        else f"there are {len(movies) or 'no'} data sets that could be the movie",
         f"{path}::{inner}" if inner else str(path),
         "the path of one data set with axes (frames, y, x)",
-        f"a file that holds {', '.join(listing)}" if listing else "a file without data sets",
+        f"{holds}, where {'; '.join(lost[:9])}" if lost else holds,
         f"Name it, for example {path.name}::{movies[0].shown}" if movies else "Name one of those, or check the file",
     )
 

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count, islice
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..errors import SourceError
-from .source import MOST_FRAMES, Permit, checked_file, reading, truncated
+from ..errors import MissingSourceError, SourceError
+from .source import MOST_FRAMES, Permit, checked_file, reading, truncated, words
 
 MOST_LINKS = 16
 """So many links may follow each other, as in libhdf5; more are a circle."""
@@ -46,23 +47,9 @@ class Access:
 
 @dataclass(frozen=True)
 class Found:
-    """A data set, as it is named by the user and where it truly is.
-
-    Attributes
-    ----------
-    shown
-        Its path as seen from the file that the user named.
-    holder
-        The file that holds it.
-    name
-        Its path in that file.
-    shape, dtype
-        Its axes and the type of its pixels.
-    """
+    """A data set: its path as seen from the file that the user named, its axes, and the type of its pixels."""
 
     shown: str
-    holder: Path
-    name: str
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
@@ -73,7 +60,7 @@ class Search:
 
     found: list[Found] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
-    seen: set[tuple[str, int]] = field(default_factory=set)
+    seen: set[tuple[int, int]] = field(default_factory=set)
     looked: int = 0
 
 
@@ -140,14 +127,15 @@ def _search(group: Any, shown: str, access: Access, search: Search, depth: int) 
     while waiting:
         at, path = waiting.popleft()
         if isinstance(at, h5py.Dataset):
-            _look(search, path, lambda at=at, path=path: search.found.append(_found(at, path)) if at.ndim else None)
+            found = _look(search, path, partial(_found, at, path))
+            search.found += [found] if found is not None and found.shape else []
             continue
         for name in _names(at, search, path):
             below = f"{path}/{name}"
-            link = _look(search, below, lambda at=at, name=name: at.get(name, getlink=True))
+            link = _look(search, below, partial(at.get, name, getlink=True))
             if isinstance(link, h5py.HardLink):
-                item = _look(search, below, lambda at=at, name=name: at[name])
-                if item is not None and _is_new(item, search):
+                item = _look(search, below, partial(at.__getitem__, name))
+                if item is not None and _look(search, below, partial(_is_new, item, search)):
                     waiting.append((item, below))
             elif isinstance(link, h5py.ExternalLink) and depth < MOST_LINKS:
                 _search_outside(at, name, below, access, search, depth)
@@ -167,7 +155,7 @@ def _search_outside(at: Any, name: str, shown: str, access: Access, search: Sear
 
 
 def _found(dataset: Any, shown: str) -> Found:
-    return Found(shown, Path(dataset.file.filename), dataset.name, dataset.shape, dataset.dtype)
+    return Found(shown, dataset.shape or (), dataset.dtype)
 
 
 def _names(group: Any, search: Search, path: str) -> list[str]:
@@ -191,13 +179,14 @@ def _look(search: Search, path: str, at: Callable[[], Any]) -> Any:
     try:
         return at()
     except DAMAGE as error:
-        search.lost.append(f"{path} is damaged: {' '.join(str(error).split())}")
+        search.lost.append(f"{path or '/'} cannot be read: {words(error)}")
         return None
 
 
 def _is_new(item: Any, search: Search) -> bool:
     """Tell whether an object is met for the first time: hard links, too, may lead in a circle."""
-    key = (os.path.realpath(item.file.filename), h5py.h5o.get_info(item.id).addr)
+    information = h5py.h5o.get_info(item.id)
+    key = (information.fileno, information.addr)
     new = key not in search.seen
     search.seen.add(key)
     return new
@@ -381,7 +370,7 @@ def _existing(name: str, holder: Path, variable: str) -> Path | None:
 
 
 def _missing(holder: Path, inner: str, name: str, what: str) -> SourceError:
-    return SourceError(
+    return MissingSourceError(
         what,
         f"{holder}::{inner}",
         f"{name}, in the folder of {holder.name} where it has no folder of its own",

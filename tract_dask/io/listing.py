@@ -58,27 +58,29 @@ def list_files(name: str, outer: Path, readers: Mapping[str, Any]) -> FileList |
     """
     if outer.is_dir():
         found = _readable(outer, readers)
-    elif _is_pattern(outer):
+    elif is_pattern(outer):
         found = _matching(outer)
     else:
+        _check_folder(outer)
         return None
     return FileList(name, tuple(sorted(found, key=lambda file: natural_key(file.name))))
 
 
-def _is_pattern(place: Path) -> bool:
-    """Tell whether a path that is not there is a pattern, which only its last part may be."""
-    if not any(sign in str(place) for sign in WILD) or os.path.lexists(place):
-        return False
-    folder = place.parent
-    if not folder.is_dir() and any(sign in str(folder) for sign in WILD):
+def is_pattern(place: Path) -> bool:
+    """Tell whether a path that is not there is a pattern for the files of a folder that is."""
+    return any(sign in place.name for sign in WILD) and not os.path.lexists(place) and place.parent.is_dir()
+
+
+def _check_folder(place: Path) -> None:
+    """Refuse a pattern for folders: only the last part of a path may be one."""
+    if any(sign in str(place.parent) for sign in WILD) and not os.path.lexists(place.parent):
         raise SourceError(
             "there is no such folder",
-            str(folder),
+            str(place.parent),
             "a folder, and a pattern for the names in it only",
             str(place),
             "Name the folder without * ? or [",
         )
-    return folder.is_dir()
 
 
 def _matching(pattern: Path) -> list[Path]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +13,6 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings import SourceSettings
-from ..stores import load_array, sole_parser
 from .blocks import open_block
 from .source import Frames, Source, SourceMetadata, checked_dtype, checked_shape, truncated, widened
 
@@ -21,15 +22,26 @@ _HEADER_BYTES = 10_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FortranSource(Source):
-    """A .npy file with the frame axis fastest (Fortran order), read through a memory map; ``n_bytes`` long."""
+    """A .npy file with the frame axis fastest (Fortran order), read through a memory map.
 
+    Attributes
+    ----------
+    axes, stored
+        Shape (two axes where it is one image) and type of the array in the file.
+    offset, n_bytes
+        Where its pixels begin, and the size of the file that holds them all.
+    """
+
+    axes: tuple[int, ...]
+    stored: np.dtype[Any]
+    offset: int
     n_bytes: int
 
     def _read(self, start: int, stop: int) -> Frames:
         size = self.files[0].stat().st_size
         if size < self.n_bytes:  # to touch a map beyond its file would end the process
             raise truncated(self.path, "before the frames that it held when it was opened", self.n_bytes, size)
-        frames = load_array(self.files[0], mmap_mode="r").reshape(self.shape)[start:stop]
+        frames = np.memmap(self.files[0], self.stored, "r", self.offset, self.axes, "F").reshape(self.shape)[start:stop]
         return widened(np.array(frames, order="C"), self.dtype)
 
 
@@ -60,7 +72,10 @@ def open_npy(path: Path, inner: str, settings: SourceSettings) -> Source:
         shape=checked_shape(shape, str(path)),
         dtype=checked_dtype(stored, str(path)),
         metadata=SourceMetadata(),
-        n_bytes=offset + int(np.prod(shape, dtype=object)) * stored.itemsize,
+        axes=tuple(shape),
+        stored=stored,
+        offset=offset,
+        n_bytes=offset + math.prod(shape) * stored.itemsize,
     )
 
 
@@ -68,12 +83,29 @@ def _header(path: Path) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Return shape, whether the order is Fortran's, pixel type, and where the pixels begin."""
     with path.open("rb") as file:
         first = np.lib.format.read_magic(file) == (1, 0)
-        start = file.tell()
         length = struct.unpack("<H" if first else "<I", file.read(2 if first else 4))[0]
         if length > _HEADER_BYTES:
             raise ValueError(f"a header of {length:,} bytes")
-        file.seek(start)
-        with sole_parser():
-            read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-            shape, fortran, stored = read(file)
-        return shape, fortran, stored, file.tell()
+        text = file.read(length)
+        return *_fields(text.decode("latin-1")), file.tell()
+
+
+_FIELD = re.compile(
+    r"""\s*(['"])(?:(descr)\1\s*:\s*(?:(['"])([<>|=]?[A-Za-z]\d*(?:\[\w+\])?)\3|\[[^\]]*\])"""
+    r"""|(fortran_order)\1\s*:\s*(True|False)|(shape)\1\s*:\s*\(([-\d\s,]*)\))\s*,?"""
+)
+"""One of the three fields, as a Python literal."""
+
+
+def _fields(text: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order and type from a header: by hand, for Python's own parser takes long, and a lock."""
+    body = text.strip()
+    fields, at = {}, 1
+    while found := _FIELD.match(body, at):
+        fields[found[2] or found[5] or found[7]] = found
+        at = found.end()
+    if set(fields) != {"descr", "fortran_order", "shape"} or body[:1] != "{" or body[at:].strip() != "}":
+        raise ValueError(text[:200])
+    shape = tuple(int(part) for part in fields["shape"][8].split(",") if part.strip())
+    stored = np.dtype(fields["descr"][4] or "V1")  # a list of fields is no type of pixels in any case
+    return shape, fields["fortran_order"][6] == "True", stored

@@ -14,7 +14,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError, TractError
+from ..errors import MissingSourceError, SourceError, TractError
 
 Frames: TypeAlias = NDArray[Any]
 """An array (frames, y, x)."""
@@ -83,6 +83,13 @@ class FrameSource(Protocol):
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
 
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside their file; empty where the file is the movie."""
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
 
@@ -106,11 +113,16 @@ class Source:
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
     metadata: SourceMetadata
+    inside: str = ""
 
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return False
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included): all, where that is not known."""
+        return slice(None)
 
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x).
@@ -132,6 +144,7 @@ class Source:
                 " x ".join(map(str, frames.shape)),
                 "Wait until it has been written, then begin again",
             )
+        self._check_exact(start, frames)
         return frames
 
     def read_into(self, start: int, frames: Frames) -> None:
@@ -143,6 +156,20 @@ class Source:
             For whatever is wrong with the file.
         """
         frames[...] = self.read(start, start + len(frames))
+
+    def _check_exact(self, start: int, frames: Frames) -> None:
+        """Refuse whole numbers that sums and fits, which are done in float64, would round without a word."""
+        if self.dtype.kind not in "iu" or self.dtype.itemsize < 8 or not frames.size:
+            return
+        low, high = int(frames.min()), int(frames.max())
+        if max(-low, high) > _EXACT:
+            raise SourceError(
+                f"frames {start} to {start + len(frames) - 1} hold whole numbers that float64 cannot tell apart",
+                self.path,
+                f"values from -{_EXACT:,} to {_EXACT:,}",
+                f"values from {low:,} to {high:,}",
+                "Subtract an offset or divide by a factor, and save the movie as float64 or uint32",
+            )
 
     def _read(self, start: int, stop: int) -> Frames:
         """Return frames as :meth:`read` does; what libraries raise becomes a SourceError there."""
@@ -218,6 +245,9 @@ FRAME_BYTES, RATIO = 64 << 20, 1000
 """A frame may claim so many bytes, and so many times the bytes of its file, before it is believed to be damaged."""
 
 MOST_FRAMES = 2**31 - 1
+"""More are a damaged header."""
+
+_EXACT = 2**53
 
 
 def checked_claim(n_bytes: int, size: int, where: str, what: str = "one frame") -> None:
@@ -252,7 +282,7 @@ def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
         try:
             status = path.stat()
         except (FileNotFoundError, NotADirectoryError) as error:
-            raise SourceError(
+            raise MissingSourceError(
                 f"the link leads to {path.readlink()}, which is not there"
                 if path.is_symlink()
                 else "there is no such file",
@@ -298,19 +328,20 @@ def reading(
     except TractError:
         raise
     except OSError as error:
-        raise unreadable(where, error, what) from _plain(error)
+        raise unreadable(where, _plain(error), what, remedy) from _plain(error)
     except MemoryError as error:
         raise TractError(
             "memory ran out while the movie was read",
             where,
-            got=_words(error),
+            got=words(error),
             remedy="Give each worker more memory, for example by fewer workers",
         ) from error
     except Exception as error:
-        raise SourceError(what, where, got=_words(error), remedy=remedy) from error
+        raise SourceError(what, where, got=words(error), remedy=remedy) from error
 
 
-def _words(error: BaseException) -> str:
+def words(error: BaseException) -> str:
+    """Return what an error says, in one line that is not too long; its name where it says nothing."""
     text = " ".join(str(error).split())
     return text[:300] or type(error).__name__
 
@@ -321,17 +352,25 @@ def _plain(error: OSError) -> OSError:
     return OSError(int(found[1]), os.strerror(int(found[1]))) if found and int(found[1]) else error
 
 
-def unreadable(where: str, error: OSError, what: str = "the file cannot be read") -> SourceError:
-    """Return the error for what the system, or a library on its behalf, says of a file."""
-    if "unable to lock file" in str(error):
-        return SourceError(
-            "another program has locked the file",
-            where,
-            got=_words(error),
-            remedy="Wait until it has been written, or close it there",
-        )
-    reason = error.strerror or _words(error)
-    return SourceError(what, where, got=reason, remedy="Check that it is there, its permissions, and its disk")
+_BUSY = (
+    ("unable to lock file", "another program has locked the file", "Wait until it is written, or close it there"),
+    (
+        "already open for write",
+        "another program is writing the file, or ended before it had written it",
+        "Wait until it is written; if nothing writes it any more, run h5clear -s on a copy",
+    ),
+)
+"""What HDF5 says of a file that is being written, and what we say."""
+
+
+def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceError:
+    """Return the error for what the system says of a file, or, with ``remedy``, what a library says of its content."""
+    for sign, said, advice in _BUSY:
+        if sign in str(error):
+            return SourceError(said, where, got=words(error), remedy=advice)
+    if error.errno is not None:
+        remedy = "Check that it is there, its permissions, and its disk"
+    return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
 def truncated(where: str, place: str, expected: int, got: int) -> SourceError:

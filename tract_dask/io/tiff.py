@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings import SourceSettings
 from .blocks import BlockSource
-from .source import Frames, Source, checked_dtype, checked_shape, truncated
+from .source import Frames, Source, checked_claim, checked_dtype, checked_shape, truncated, widened, words
+from .tiff_codecs import CODECS, PART_BYTES, check_codestreams
 from .tiff_metadata import Description, describe
 from .tiff_pages import Page, walk
 
@@ -44,12 +45,13 @@ class PagedSource(Source):
                 for k, directory in enumerate(directories.tolist()):
                     tiff.filehandle.seek(directory)
                     page = tifffile.TiffPage(tiff, index=start + k)
-                    frames[k] = page.asarray(maxworkers=1).reshape(self.shape[1:])
+                    check_codestreams(tiff.filehandle, page, self.path)
+                    frames[k] = widened(page.asarray(maxworkers=1).reshape(self.shape[1:]), self.dtype)
         except _DAMAGE as error:
             raise SourceError(
                 f"page {start + k} (counted from 0) cannot be decoded",
                 self.path,
-                got=" ".join(str(error).split()),
+                got=words(error),
                 remedy="Export the movie again, uncompressed if that helps",
             ) from error
         return frames
@@ -70,7 +72,7 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings) -> Source:
             "the movie has no frames", str(path), "at least one page", "none", "Check how it was exported"
         )
     _check_first(pages[0], path)
-    description = describe(tags, path)
+    description = describe(tags, path, len(pages))
     if description.order is not None and len(pages) >= len(description.order):
         pages = _ordered(pages, description.order, path)
     _check_alike(pages, path)
@@ -86,6 +88,7 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings) -> Source:
     }
     if all(page.plain for page in pages):
         return BlockSource(**common, shape=shape, dtype=dtype, offsets=offsets, stored=pages[0].stored)
+    _check_claims(pages, path)
     directories = np.array([page.directory for page in pages], np.int64)
     return PagedSource(**common, shape=shape, dtype=dtype, directories=directories)
 
@@ -100,6 +103,30 @@ def _check_first(page: Page, path: Path) -> None:
             "Save the movie as greyscale, from the data and not from the screen",
         )
     checked_dtype(page.stored, str(path))
+
+
+def _check_claims(pages: list[Page], path: Path) -> None:
+    """Check what pages that are decoded take, before they are."""
+    size = path.stat().st_size
+    for number, page in enumerate(pages):
+        n_bytes = page.shape[0] * page.shape[1] * page.stored.itemsize
+        checked_claim(n_bytes, size, str(path), f"page {number} (counted from 0)")
+        if page.compression not in CODECS:
+            raise SourceError(
+                f"the compression of page {number} (counted from 0) is not read",
+                str(path),
+                f"none, or one of {', '.join(sorted(set(CODECS.values()) - {'none'}))}",
+                f"number {page.compression}",
+                "Export the movie again, uncompressed if that helps",
+            )
+        if page.segment_bytes > PART_BYTES + 2 * n_bytes:
+            raise SourceError(
+                f"the strips or tiles of page {number} (counted from 0) are far larger than the page",
+                str(path),
+                f"at most {PART_BYTES + 2 * n_bytes:,} bytes",
+                f"{page.segment_bytes:,} bytes",
+                "The file is damaged: export the movie again",
+            )
 
 
 def _check_alike(pages: list[Page], path: Path) -> None:

@@ -11,12 +11,9 @@ from xml.etree import ElementTree
 
 from ..errors import SourceError
 from .source import NOTHING_KNOWN, SourceMetadata
-from .tiff_pages import Tags
+from .tiff_pages import DESCRIPTION, DM_SCALES, DM_UNITS, RESOLUTION_UNIT, X_RESOLUTION, Y_RESOLUTION, Tags
 from .units import square_pixel, to_pm, to_seconds
 
-DESCRIPTION, X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT = 270, 282, 283, 296
-_DM_UNITS = (65003, 65004, 65005)
-_DM_SCALES = (65009, 65010, 65011)
 _RESOLUTION_UNITS = {3: "cm"}
 
 
@@ -45,8 +42,8 @@ class Description:
     metadata: SourceMetadata = NOTHING_KNOWN
 
 
-def describe(tags: Tags, path: Path) -> Description:
-    """Return what the first page's tags say about the movie.
+def describe(tags: Tags, path: Path, n_pages: int) -> Description:
+    """Return what the first page's tags say about the movie, whose file has ``n_pages``.
 
     Raises
     ------
@@ -57,7 +54,7 @@ def describe(tags: Tags, path: Path) -> Description:
     if text.startswith("ImageJ="):
         return _imagej(text, tags, path)
     if text.endswith("OME>"):
-        return _ome(text, path)
+        return _ome(text, path, n_pages)
     if text.startswith('{"shape"'):
         return _shaped(text, tags, path)
     return Description(
@@ -78,8 +75,8 @@ def _imagej(text: str, tags: Tags, path: Path) -> Description:
 def _shaped(text: str, tags: Tags, path: Path) -> Description:
     try:
         fields = json.loads(text)
-        shape = [n for n in fields["shape"][:-2] if n > 1]
-    except (ValueError, TypeError, KeyError):
+        shape = [int(n) for n in fields["shape"][:-2] if n > 1]
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
         return Description(metadata=_resolution(tags, ""))
     if len(shape) > 1:
         _one_axis(path, **{f"axis {k}": n for k, n in enumerate(shape)})
@@ -88,13 +85,13 @@ def _shaped(text: str, tags: Tags, path: Path) -> Description:
     return Description("TIFF", n_frames, bool(fields.get("truncated")), metadata=_resolution(tags, unit))
 
 
-def _ome(text: str, path: Path) -> Description:
+def _ome(text: str, path: Path, n_pages: int) -> Description:
+    if "<!" in text.replace("<!--", ""):
+        raise _damaged_ome("a declaration of types or entities, which OME does not know", path)
     try:
         root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise SourceError(
-            "the OME description is damaged", str(path), got=str(error), remedy="Export the movie again"
-        ) from error
+    except (ElementTree.ParseError, ValueError) as error:
+        raise _damaged_ome(str(error), path) from error
     images = root.findall("{*}Image")
     pixels = root.find("{*}Image/{*}Pixels")
     if pixels is None:
@@ -117,26 +114,35 @@ def _ome(text: str, path: Path) -> Description:
     metadata = SourceMetadata(pixel, seconds, notes=notes)
     if spread:
         return Description("OME-TIFF", metadata=metadata)
-    return Description("OME-TIFF", n_frames, order=_ome_order(pixels, n_frames), metadata=metadata)
+    order = _ome_order(pixels, n_frames, path) if n_frames <= n_pages else None
+    return Description("OME-TIFF", n_frames, order=order, metadata=metadata)
 
 
-def _ome_order(pixels: Any, n_frames: int) -> tuple[int, ...]:
+def _damaged_ome(got: str, path: Path) -> SourceError:
+    return SourceError("the OME description is damaged", str(path), got=got, remedy="Export the movie again")
+
+
+def _ome_order(pixels: Any, n_frames: int, path: Path) -> tuple[int, ...]:
     """Return the page of each frame, as the TiffData elements say."""
     pages = list(range(n_frames))
+    named = 0
     for block in pixels.findall("{*}TiffData"):
         page, frame = _integer(block.attrib, "IFD", 0), sum(_integer(block.attrib, f"First{a}", 0) for a in "TZC")
         count = _integer(block.attrib, "PlaneCount", 1 if "IFD" in block.attrib else n_frames)
-        for step in range(min(count, n_frames - frame)):
-            pages[frame + step] = page + step
+        steps = max(0, min(count, n_frames - frame))
+        named += steps
+        if named > 16 * n_frames:
+            raise _damaged_ome(f"{n_frames} frames whose pages are named again and again", path)
+        pages[frame : frame + steps] = range(page, page + steps)
     return tuple(pages)
 
 
 def _dm(tags: Tags) -> SourceMetadata | None:
     """Return the calibration that DigitalMicrograph leaves in its own tags."""
-    if not all(tags.get(tag) for tag in _DM_UNITS[:1] + _DM_SCALES[:1]):
+    if not all(tags.get(tag) for tag in DM_UNITS[:1] + DM_SCALES[:1]):
         return None
-    scales = [_number(str(_first(tags, tag))) for tag in _DM_SCALES]
-    units = [_text(tags, tag) for tag in _DM_UNITS]
+    scales = [_number(str(_first(tags, tag))) for tag in DM_SCALES]
+    units = [_text(tags, tag) for tag in DM_UNITS]
     pixel, notes = square_pixel(to_pm(scales[0], units[0]), to_pm(scales[1], units[1]))
     return SourceMetadata(pixel, to_seconds(scales[2], units[2]), notes=notes)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import SourceError
 from .source import truncated
@@ -23,10 +24,19 @@ _TYPES |= {13: "I", 16: "Q", 17: "q", 18: "Q"}
 
 SUBFILE, WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER = 254, 256, 257, 258, 259, 266
 STRIP_OFFSETS, SAMPLES, STRIP_ROWS, STRIP_BYTES, PREDICTOR = 273, 277, 278, 279, 317
-TILE_WIDTH, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT, DEPTH = 322, 324, 325, 339, 32997
-_NEEDED = frozenset(
-    (SUBFILE, WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER, STRIP_OFFSETS, SAMPLES, STRIP_ROWS, STRIP_BYTES)
-) | frozenset((PREDICTOR, TILE_WIDTH, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT, DEPTH))
+TILE_WIDTH, TILE_LENGTH, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT, DEPTH = 322, 323, 324, 325, 339, 32997
+DESCRIPTION, X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT = 270, 282, 283, 296
+DM_UNITS, DM_SCALES = (65003, 65004, 65005), (65009, 65010, 65011)
+
+_PLACES = frozenset((STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES))
+_NEEDED = _PLACES | frozenset(
+    (SUBFILE, WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER, SAMPLES, STRIP_ROWS, PREDICTOR, TILE_WIDTH, TILE_LENGTH)
+)
+_NEEDED |= frozenset((SAMPLE_FORMAT, DEPTH))
+_OF_THE_FIRST = frozenset((DESCRIPTION, X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, *DM_UNITS, *DM_SCALES))
+
+_FEW = 64
+"""So many numbers are read of a tag that does not say where pixels are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +53,14 @@ class Page:
         Pixel type with the file's byte order; ``bool`` for single bits.
     offset, end
         Where its data begin, and end at the latest.
+    segment_bytes
+        What the largest of its strips or tiles takes once it is decoded.
     plain
         The data are one run of bytes, row after row, uncompressed.
     reduced
         A small copy of another page.
+    compression
+        The number of its codec.
     """
 
     directory: int
@@ -54,8 +68,10 @@ class Page:
     stored: np.dtype[Any]
     offset: int
     end: int
+    segment_bytes: int
     plain: bool
     reduced: bool
+    compression: int
 
 
 @dataclass(frozen=True)
@@ -90,7 +106,7 @@ class _Tiff:
 
 
 def walk(path: Path) -> tuple[list[Page], Tags]:
-    """Return all pages of a TIFF in order, and every tag of the first.
+    """Return all pages of a TIFF in order, and the tags of the first that say something of the movie.
 
     Raises
     ------
@@ -104,14 +120,17 @@ def walk(path: Path) -> tuple[list[Page], Tags]:
         pages: list[Page] = []
         first_tags: Tags = {}
         seen = set()
+        read = 0
         while following:
             if following in seen:
-                raise SourceError(
-                    f"page {len(pages)} leads back to an earlier page", str(path), remedy="Export the movie again"
-                )
+                raise _damaged_chain(f"page {len(pages)} leads back to an earlier page", path)
             seen.add(following)
-            entries, after = _directory(tiff, following, len(pages))
-            tags = {tag: _value(tiff, *entry) for tag, entry in entries.items() if tag in _NEEDED or not pages}
+            entries, after, n_bytes = _directory(tiff, following, len(pages))
+            wanted = _NEEDED if pages else _NEEDED | _OF_THE_FIRST
+            tags = {tag: _value(tiff, tag, *entry) for tag, entry in entries.items() if tag in wanted}
+            read += n_bytes
+            if read > size + _SLACK:
+                raise _damaged_chain(f"the directories up to page {len(pages)} overlap", path)
             page = _page(tags, following, dialect, path, len(pages))
             if page.end > size:
                 raise truncated(str(path), f"inside the data of page {len(pages)} (counted from 0)", page.end, size)
@@ -119,6 +138,13 @@ def walk(path: Path) -> tuple[list[Page], Tags]:
             pages.append(page)
             following = after
     return pages, first_tags
+
+
+_SLACK = 1 << 16
+
+
+def _damaged_chain(what: str, path: Path) -> SourceError:
+    return SourceError(what, str(path), remedy="Export the movie again")
 
 
 def _start(file: BinaryIO, path: Path) -> tuple[Dialect, int]:
@@ -139,8 +165,11 @@ def _start(file: BinaryIO, path: Path) -> tuple[Dialect, int]:
     )
 
 
-def _directory(tiff: _Tiff, start: int, number: int) -> tuple[dict[int, tuple[int, int, bytes]], int]:
-    """Return the entries (tag: type, count, value or its place) of a directory, and where the next one is."""
+def _directory(tiff: _Tiff, start: int, number: int) -> tuple[dict[int, tuple[int, int, bytes]], int, int]:
+    """Return the entries (tag: type, count, value or its place) of a directory, where the next one is, and its bytes.
+
+    Its bytes include those that its tags take elsewhere in the file.
+    """
     dialect = tiff.dialect
     entry = struct.Struct(dialect.order + dialect.entry)
     count_bytes, pointer_bytes = struct.calcsize(dialect.order + dialect.count), struct.calcsize(dialect.pointer)
@@ -151,19 +180,30 @@ def _directory(tiff: _Tiff, start: int, number: int) -> tuple[dict[int, tuple[in
         expected = start + count_bytes + n_bytes + pointer_bytes
         raise truncated(str(tiff.path), f"before the directory of page {number} (counted from 0)", expected, tiff.size)
     entries = {tag: (kind, count, raw) for tag, kind, count, raw in entry.iter_unpack(tail[:n_bytes])}
-    return entries, dialect.parse(dialect.pointer, tail[n_bytes:])[0]
+    elsewhere = sum(n for kind, count, _ in entries.values() if (n := _n_bytes(kind, count)) <= tiff.size)
+    return entries, dialect.parse(dialect.pointer, tail[n_bytes:])[0], len(tail) + elsewhere
 
 
-def _value(tiff: _Tiff, kind: int, count: int, raw: bytes) -> Any:
-    """Return the value of a tag; empty where its type is unknown or it lies outside the file."""
-    code = _TYPES.get(kind)
-    if code is None:
+def _n_bytes(kind: int, count: int) -> int:
+    return struct.calcsize("<" + _TYPES.get(kind, "")) * count
+
+
+def _value(tiff: _Tiff, tag: int, kind: int, count: int, raw: bytes) -> Any:
+    """Return the value of a tag; empty where its type is unfit or it lies outside the file."""
+    code = _TYPES.get(kind, "")
+    if not code or (tag in _NEEDED and code not in "BHIQbhiq"):
         return ()
-    n_bytes = struct.calcsize(tiff.dialect.order + code) * count
-    inside = n_bytes <= len(raw)
-    data = raw[:n_bytes] if inside else tiff.read(tiff.dialect.parse(tiff.dialect.pointer, raw)[0], n_bytes)
+    n_bytes = _n_bytes(kind, count)
+    start = None if n_bytes <= len(raw) else tiff.dialect.parse(tiff.dialect.pointer, raw)[0]
+    if start is not None and start + n_bytes > tiff.size:
+        return ()
+    if code != "s" and tag not in _PLACES:
+        count, n_bytes = min(count, _FEW), _n_bytes(kind, min(count, _FEW))
+    data = raw[:n_bytes] if start is None else tiff.read(start, n_bytes)
     if code == "s":
         return data
+    if tag in _PLACES:
+        return np.frombuffer(data, tiff.dialect.order + {"I": "u4", "Q": "u8", "H": "u2"}.get(code, code))
     return tiff.dialect.parse(code * count if len(code) > 1 else f"{count}{code}", data) if data else ()
 
 
@@ -173,29 +213,52 @@ def _page(tags: Tags, directory: int, dialect: Dialect, path: Path, number: int)
     def first(tag: int, default: int = 0) -> int:
         return int((tags.get(tag) or (default,))[0])
 
-    offsets = tags.get(TILE_OFFSETS) or tags.get(STRIP_OFFSETS) or ()
-    counts = tags.get(TILE_BYTES) or tags.get(STRIP_BYTES) or ()
+    tiled = TILE_WIDTH in tags
+    offsets, counts = (
+        next((tags[tag] for tag in pair if len(tags.get(tag, ()))), np.zeros(0, np.uint8))
+        for pair in ((TILE_OFFSETS, STRIP_OFFSETS), (TILE_BYTES, STRIP_BYTES))
+    )
     n_y, n_x, n_bits = first(LENGTH), first(WIDTH), first(BITS, 1)
-    if not (offsets and min(offsets) >= 0 and n_y > 0 and n_x > 0 and 1 <= n_bits <= 64):
+    raw = first(COMPRESSION, 1) == first(PREDICTOR, 1) == first(FILL_ORDER, 1) == 1 and not tiled
+    rows = n_y if raw and len(offsets) == 1 else min(first(STRIP_ROWS, n_y) or n_y, n_y)
+    part = (first(TILE_LENGTH), first(TILE_WIDTH)) if tiled else (rows, n_x)
+    sound = n_y > 0 and n_x > 0 and 1 <= n_bits <= 64 and min(part) > 0
+    needed = -(-n_y // part[0]) * -(-n_x // part[1]) if sound else 1
+    if not sound or len(offsets) < needed or offsets.min() < 0:
         raise SourceError(
             f"page {number} (counted from 0) does not say where its pixels are",
             str(path),
-            "width, length, bits a sample and strip or tile offsets",
+            f"width, length, bits a sample and strip or tile offsets{f', {needed} of them' if sound else ''}",
             f"width {n_x}, length {n_y}, {n_bits} bits, {len(offsets)} strips or tiles",
             "Export the movie again",
         )
     stored = _pixel_type(first(SAMPLE_FORMAT, 1), n_bits).newbyteorder(dialect.order)
     several = tuple(value for value in (first(SAMPLES, 1), first(DEPTH, 1)) if value > 1)
     row_bytes = n_x * stored.itemsize
-    plain = (
-        first(COMPRESSION, 1) == first(PREDICTOR, 1) == first(FILL_ORDER, 1) == 1
-        and TILE_WIDTH not in tags
-        and not several
-        and n_bits == 8 * stored.itemsize
-        and _adjacent(offsets, min(first(STRIP_ROWS, n_y) or n_y, n_y) * row_bytes)
+    plain = raw and not several and n_bits == 8 * stored.itemsize and _adjacent(offsets, part[0] * row_bytes)
+    end = int(offsets[0]) + n_y * row_bytes if plain else _end(offsets[:needed], counts[:needed])
+    n_bytes = part[0] * part[1] * stored.itemsize
+    return Page(
+        directory,
+        (n_y, n_x, *several),
+        stored,
+        int(offsets[0]),
+        end,
+        n_bytes,
+        plain,
+        bool(first(SUBFILE) & 1),
+        first(COMPRESSION, 1),
     )
-    end = offsets[0] + n_y * row_bytes if plain else max(map(sum, zip(offsets, counts, strict=False)), default=0)
-    return Page(directory, (n_y, n_x, *several), stored, offsets[0], end, plain, bool(first(SUBFILE) & 1))
+
+
+def _end(offsets: NDArray[Any], counts: NDArray[Any]) -> int:
+    """Return where the last strip or tile ends; Python's numbers know no overflow."""
+    far = max(int(offsets.max()), int(counts.max(initial=0)))
+    if far >= 2**62:
+        return far
+    ends = offsets.astype(np.int64)
+    ends[: len(counts)] += counts.astype(np.int64)
+    return int(ends.max())
 
 
 def _pixel_type(sample_format: int, n_bits: int) -> np.dtype[Any]:
@@ -207,5 +270,5 @@ def _pixel_type(sample_format: int, n_bits: int) -> np.dtype[Any]:
     return np.dtype(f"{kind}{max(n_bytes, {'f': 2, 'c': 8}.get(kind, 1))}")
 
 
-def _adjacent(offsets: tuple[int, ...], strip_bytes: int) -> bool:
-    return all(offset == offsets[0] + k * strip_bytes for k, offset in enumerate(offsets))
+def _adjacent(offsets: NDArray[Any], strip_bytes: int) -> bool:
+    return len(offsets) == 1 or bool((np.diff(offsets.astype(np.float64)) == strip_bytes).all())

@@ -16,6 +16,7 @@ from contextlib import suppress
 from http import HTTPStatus
 from urllib.parse import quote, unquote, urlsplit
 
+import httpcore  # noqa: F401  httpx would import it with its first client, while other threads import h11 and anyio
 import httpx
 import websockets
 from fastapi import APIRouter, Request, WebSocket

@@ -203,7 +203,7 @@ def check_source(place: str | FileList, settings: RunSettings, folder: Path | No
     with closing(open_source(place, settings.source, settings.metadata, permit=permit)) as source:
         check_inputs(source, settings)
         if folder is not None and folder.exists():
-            check_output(Outputs(folder), source, overwrite=False)
+            check_output(Outputs(folder), source, settings, overwrite=False)
         return Checked(source.shape, source.dtype.name, plan_run(source.shape, source.dtype, settings))
 
 

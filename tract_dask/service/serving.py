@@ -206,11 +206,25 @@ def check_access(config: ServiceConfig) -> list[str]:
 
 
 def check_traffic(config: ServiceConfig) -> list[str]:
-    """Return what the user should know about the traffic of Dask."""
+    """Return what the user should know about the traffic of Dask.
+
+    Raises
+    ------
+    InputError
+        Where tokens keep others out, and the cluster would let them in.
+    """
     cluster = config.cluster
-    address = urlsplit(cluster.scheduler or "")
-    is_near = cluster.resolved_kind == "local" or host_name(address.netloc) in LOOPBACK
-    if is_near or cluster.tls is not None:
+    if cluster.resolved_kind == "local" or cluster.tls is not None:
+        return []
+    if config.needs_tokens:
+        raise InputError(
+            "tokens would keep nobody out: whoever reaches this cluster can run code on it",
+            f"cluster of kind {cluster.resolved_kind}",
+            "a cluster with TLS",
+            "one without",
+            "Make certificates with tract-dask certs DIR, start the cluster with them, and give them with --tls DIR",
+        )
+    if host_name(urlsplit(cluster.scheduler or "").netloc) in LOOPBACK:
         return []
     return [
         "Dask's traffic is not encrypted, and whoever reaches the scheduler can run code on it: "

@@ -167,7 +167,8 @@ class Attempt(Thread):
                 cluster = self._cluster()  # while the process imports what it needs
                 if cluster is None:
                     return self._ending(0)
-                _tell(process, json.dumps(order | {"cluster": to_dict(cluster)}))
+                where = {"cluster": to_dict(cluster), "credentials": self._keeper.credentials}
+                _tell(process, json.dumps(order | where))
                 last_lines = self._follow(process)
                 with suppress(subprocess.TimeoutExpired):  # it has said its last, and does not end
                     process.wait(GRACE_S)

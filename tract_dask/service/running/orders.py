@@ -16,12 +16,13 @@ from distributed import default_client
 from distributed.comm import CommClosedError
 
 from ... import pipeline, stores
+from ...dispatch import JOB
 from ...errors import ClusterError, TractError
 from ...io import FileList
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, silent
 from ...settings import RunSettings, from_dict
-from ...tasks import JOB
 from ...terminal import clock
+from ...tls import using
 from ..folders import DataRoot
 from ..outputs import Mark, claim
 from .timeline import Timeline
@@ -150,7 +151,8 @@ def carry_out(order: dict[str, Any], stream: IO[str]) -> int:
     """Do what an order says, and say to ``stream`` how it went and ended; return the exit code of the process."""
     reporter = Reporter(stream, order["stages"])
     try:
-        outcome = run_order(order, reporter).to_record()
+        with using(order["credentials"]):
+            outcome = run_order(order, reporter).to_record()
     except KeyboardInterrupt:
         reporter.end(kind="interrupted")
         return 130
