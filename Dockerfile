@@ -28,7 +28,8 @@ ENV PATH=/opt/tract/bin:$PATH \
     JE_ARROW_MALLOC_CONF=background_thread:false
 # Volumes take over the owner of the folders that they are mounted on.
 RUN useradd --uid 1000 --create-home tract \
-    && install -d -o tract -g tract -m 750 /srv/data /srv/cache /srv/certs /srv/authority
+    && install -d -o tract -g tract -m 750 /srv/data /srv/cache /srv/certs /srv/authority \
+    && install -d -o tract -g tract -m 700 /srv/state
 COPY --from=build /opt/tract /opt/tract
 COPY --chmod=755 deploy/healthcheck /usr/local/bin/healthcheck
 USER tract
@@ -36,4 +37,4 @@ WORKDIR /srv/data
 EXPOSE 8000
 HEALTHCHECK --interval=30s --timeout=10s --start-period=60s \
     CMD ["healthcheck", "http://127.0.0.1:8000/api/v1/health"]
-CMD ["tract-dask", "serve", "--data-root", "/srv/data"]
+CMD ["tract-dask", "serve", "--data-root", "/srv/data", "--state-dir", "/srv/state"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +14,9 @@ import xarray as xr
 from hypothesis import settings
 from numba.core.dispatcher import Dispatcher
 
-from tract_dask import schema
+from tract_dask import parts, results, schema
+from tract_dask.journal import Journal, journal_beside
+from tract_dask.shards import Shard, split
 
 settings.register_profile("checks", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("checks")
@@ -35,6 +38,14 @@ def _untraced(compile_):
 
 
 Dispatcher.compile = _untraced(Dispatcher.compile)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def state_home(tmp_path_factory):
+    """Services keep their tokens outside of their data root: here, and not in the home of who runs the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +155,28 @@ class Scene:
                 "exposure": (("y", "x"), np.full(self.shape, self.n_frames, np.uint32)),
             }
         )
+
+
+def add_fits(
+    path: Path, values: dict[str, np.ndarray], shards: Iterable[Shard], step: int, key: str = "key", record: bool = True
+) -> Journal:
+    """Add the fits of shards to the results at ``path``, as the tasks of the stage do."""
+    journal = Journal(journal_beside(path), key)
+    for shard in shards:
+        with journal.batch() as done:
+            part = {name: of[shard.start : shard.stop] for name, of in values.items()}
+            parts.write(journal.path, shard, part, step)
+            if record:
+                done(shard, {})
+    return journal
+
+
+def store_fits(path: Path, values: dict[str, np.ndarray], step: int, key: str = "key") -> None:
+    """Store the fits of all frames in the results at ``path``, which are complete then."""
+    journal = add_fits(path, values, split(len(values["fit"]), step), step, key)
+    parts.join(path, journal)
+    results.finish(path)
+    journal.remove()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tract_dask import progress, provenance, settings, stores
 from tract_dask.errors import DestinationError, SettingsError, SourceError, StoreError, TractError
 from tract_dask.journal import Journal
+from tract_dask.keyed import counted
 from tract_dask.settings import ColumnSettings, FitSettings, RunSettings
 from tract_dask.shards import Shard, split
 from tract_dask.tasks import run_shards
@@ -73,9 +74,11 @@ def test_events_become_lines_of_json(tmp_path):
 
 
 def test_keys_tell_settings_apart_and_parts_from_each_other():
-    assert provenance.stage_key(FitSettings()) == provenance.stage_key(FitSettings())
-    assert provenance.stage_key(FitSettings()) != provenance.stage_key(FitSettings(threshold=3.0))
-    assert provenance.stage_key("ab", "c") != provenance.stage_key("a", "bc")
+    key = provenance.stage_key
+    assert key("fit", counted("fit", fit=FitSettings())) == key("fit", counted("fit", fit=FitSettings()))
+    assert key("fit", counted("fit", fit=FitSettings())) != key("fit", counted("fit", fit=FitSettings(threshold=3.0)))
+    assert key("fit", "ab", "c") != key("fit", "a", "bc")
+    assert key("fit", "ab") != key("sum", "ab")
 
 
 def test_a_fingerprint_changes_with_the_file(tmp_path):

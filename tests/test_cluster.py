@@ -18,6 +18,7 @@ from tract_dask.errors import ClusterError, SettingsError
 from tract_dask.options import collect
 from tract_dask.service.running.keeper import Keeper
 from tract_dask.settings import ClusterSettings, from_toml, to_toml
+from tract_dask.tls import using
 
 VERSION = importlib.metadata.version("tract_dask")
 
@@ -325,7 +326,7 @@ def test_keeper_starts_a_killed_cluster_again_and_leaves_nothing_behind(tmp_path
         file = Path(found.scheduler_file)
         wait_for(lambda: file.exists() and json.loads(file.read_text())["address"] != first)
         assert keeper.ready(1.0) == found
-        with cluster.connect(found) as client:
+        with using(keeper.credentials), cluster.connect(found) as client:
             assert client.submit(sum, [1, 2]).result() == 3
         holder = next(
             child for child in psutil.Process().children() if "tract_dask.service.running.holder" in child.cmdline()

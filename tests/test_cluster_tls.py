@@ -1,17 +1,26 @@
 """Encrypted clusters: local ones, running ones, and what is told where certificates and addresses do not fit."""
 
+import asyncio
+import contextlib
 import json
+import os
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import numpy as np
+import psutil
 import pytest
 import xarray as xr
 from conftest import Scene
+from distributed import Client
+from distributed.core import rpc
 
 from tract_dask import cluster, pipeline, tls
 from tract_dask.certificates import make_certificates
@@ -139,3 +148,92 @@ def test_missing_certificate_is_named(tmp_path):
         tls.security(str(tmp_path))
     assert "dask-key.pem" in caught.value.got
     assert "tract-dask certs" in caught.value.remedy
+
+
+def listening(pids: list[int]) -> set[int]:
+    """Ports on which processes listen and speak Dask's protocol: all but those of pages."""
+    found = {
+        connection.laddr.port
+        for pid in pids
+        for connection in psutil.Process(pid).net_connections()
+        if connection.status == psutil.CONN_LISTEN
+    }
+    return {port for port in found if not speaks_http(port)}
+
+
+def speaks_http(port: int) -> bool:
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+        line.sendall(b"GET /health HTTP/1.0\r\n\r\n")
+        line.settimeout(2)
+        with contextlib.suppress(OSError):
+            return line.recv(4) == b"HTTP"
+    return False
+
+
+async def says(address: str, **arguments: object) -> object:
+    """What the process at an address answers to Dask's own question who it is."""
+    async with rpc(address, timeout=2, **arguments) as other:
+        return await asyncio.wait_for(other.identity(), 4)
+
+
+def test_nobody_else_can_say_a_word_to_a_local_cluster():
+    with cluster.connect(ClusterSettings(workers=1, memory_limit="1GB")) as client:
+        children = [process.pid for process in psutil.Process().children(recursive=True)]
+        ports = listening([os.getpid(), *children])
+        mine = {int(str(address).rpartition(":")[2]) for address in about(client)}
+        assert mine <= ports, "scheduler, worker and nanny"
+        stranger = tls.in_memory(tls.temporary_credentials()).get_connection_args("client")
+        for port in ports:
+            with pytest.raises((OSError, asyncio.TimeoutError)):
+                asyncio.run(says(f"tcp://127.0.0.1:{port}"))
+            with pytest.raises((OSError, asyncio.TimeoutError)):
+                asyncio.run(says(f"tls://127.0.0.1:{port}", connection_args=stranger))
+        friend = client.security.get_connection_args("client")
+        for address in about(client):
+            assert asyncio.run(says(address, connection_args=friend))
+
+
+def about(client: Client) -> list[str]:
+    """Addresses of scheduler, workers and nannies."""
+    workers = client.scheduler_info()["workers"]
+    return [client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())]
+
+
+@pytest.mark.parametrize("address", ["tcp", "tls"])
+def test_a_client_without_the_credentials_does_not_get_in(address):
+    with cluster.connect(ClusterSettings(workers=1, memory_limit="1GB")) as client:
+        port = client.scheduler.address.rpartition(":")[2]
+        others = tls.in_memory(tls.temporary_credentials()) if address == "tls" else None
+        with pytest.raises(OSError, match=r"(?i)timed out|closed|connect|certificate"):
+            Client(f"{address}://127.0.0.1:{port}", security=others, timeout=1)
+
+
+def test_credentials_are_neither_in_arguments_nor_in_the_environment_nor_in_files(tmp_path):
+    keeper = Keeper(ClusterSettings(workers=1, memory_limit="1GB"), tmp_path)
+    keeper.start()
+    try:
+        settings = keeper.ready(60.0)
+        secret = keeper.credentials["key"].splitlines()[1]
+        wait_for(keeper.workers)
+        for process_ in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                assert secret not in " ".join(process_.cmdline())
+                assert secret not in str(process_.environ())
+        assert not any(secret in file.read_text() for file in tmp_path.rglob("*") if file.is_file())
+        assert secret not in str(settings)
+        with pytest.raises(ClusterError, match="speaks TLS"), cluster.connect(settings, timeout_s=2.0):
+            pass
+        with tls.using(keeper.credentials), cluster.connect(settings) as client:
+            assert client.submit(sum, [1, 2]).result() == 3
+    finally:
+        keeper.stop()
+
+
+def test_the_pages_of_a_local_cluster_let_nobody_change_anything():
+    with cluster.connect(ClusterSettings(workers=1, memory_limit="1GB")) as client:
+        page = client.dashboard_link.rsplit("/", 1)[0]
+        for path in ("/api/v1/retire_workers", "/api/v1/adaptive_target", "/api/v1/get_workers"):
+            with pytest.raises(HTTPError) as caught:
+                urlopen(f"{page}{path}", data=b"{}", timeout=60)
+            assert caught.value.code in (404, 405)
+        assert client.submit(sum, [1, 2]).result() == 3

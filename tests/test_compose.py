@@ -143,6 +143,7 @@ def test_limits_and_privileges(parts):
         assert parts[name]["healthcheck"]
     seen = {volume.split(":")[0] for name in set(parts) - {"certs"} for volume in parts[name]["volumes"]}
     assert "authority" not in seen
+    assert {name for name in parts if "state:/srv/state" in parts[name].get("volumes", ())} == {"tokens", "service"}
 
 
 def test_the_image_sets_what_local_workers_get():
@@ -153,9 +154,9 @@ def test_job_runs_through_the_parts(deployment):
     movie = deployment.folder / "volumes" / "data" / "movie.npy"
     np.save(movie, Scene(n_frames=8).counts())
     # a client elsewhere: it has the certificate of the authority and a token, as a user would
-    user = {"volumes": ["data:/srv/data", "certs:/srv/certs"]}
+    user = {"volumes": ["state:/srv/state", "certs:/srv/certs"]}
     at = ["--server", "https://service:8000", "--ca", "/srv/certs/ca.pem"]
-    at += ["--token-file", "/srv/data/.tract_dask/admin.token"]
+    at += ["--token-file", "/srv/state/admin.token"]
     submit = ["tract-dask", "submit", "movie.npy", "--shard-mb", "1", "--watch", "--json", *at]
     process = deployment.start("user", submit, user, STRANGER, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     said, progress = process.communicate(timeout=240)
@@ -170,7 +171,7 @@ def test_job_runs_through_the_parts(deployment):
 
 
 def test_dask_dashboard_comes_through_the_service(deployment):
-    token = (deployment.folder / "volumes" / "data" / ".tract_dask" / "admin.token").read_text().strip()
+    token = (deployment.folder / "volumes" / "state" / "admin.token").read_text().strip()
     script = (
         "import httpx, ssl; context = ssl.create_default_context(cafile='/srv/certs/ca.pem')\n"
         "answer = httpx.get('https://service:8000/dask/status', verify=context,"

@@ -177,3 +177,10 @@ def test_every_script_is_run_by_the_checks():
 
 def test_changelog_has_a_place_for_what_is_new():
     assert "## [Unreleased]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_what_shows_a_promise_is_there():
+    text = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:tests|scripts)/[a-z_.]+)", text))
+    assert len(named) > 15
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []

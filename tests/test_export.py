@@ -10,14 +10,14 @@ import pytest
 import scipy.io
 import xarray as xr
 from click.testing import CliRunner
+from conftest import store_fits
 from pyarrow import parquet
 
-from tract_dask import accepted, cli, export, open_results, results, schema, stores
+from tract_dask import accepted, cli, export, open_results, results, schema
 from tract_dask.errors import DestinationError, InputError, SettingsError, StoreError
 from tract_dask.export import original_layout, read_atoms, table, to_xyz
 from tract_dask.kernels.gaussian import evaluate
 from tract_dask.settings import FitSettings, to_toml
-from tract_dask.shards import Shard
 
 N_FRAMES, N_COLUMNS = 11, 4
 FULL = ("x", "y", "x_stderr", "intensity", "status", "drift_x", "drift_y", "noise", "accepted", "time", "n_iterations")
@@ -51,10 +51,7 @@ def store(scene, tmp_path):
     values["fit"][..., schema.THETA] = rng.uniform(-1.5, 1.5, (N_FRAMES, N_COLUMNS))
     values["status"] = np.zeros((N_FRAMES, N_COLUMNS), np.uint8)
     values["status"][3, 1], values["status"][9, 2] = 1, 2
-    for k, start in enumerate(range(0, N_FRAMES, 4)):
-        shard = Shard(k, start, min(start + 4, N_FRAMES))
-        results.write(path, shard, {name: array[shard.start : shard.stop] for name, array in values.items()}, 4)
-    stores.update_attributes(path, complete=True)
+    store_fits(path, values, 4)
     return path
 
 

@@ -14,7 +14,8 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tract_dask.io import READERS, open_cached, open_source
+from tract_dask.errors import SourceError
+from tract_dask.io import READERS, FileList, open_cached, open_source
 from tract_dask.io.blocks import BlockSource
 from tract_dask.io.sequence import natural_key
 from tract_dask.settings import MetadataSettings, SourceSettings
@@ -293,6 +294,42 @@ def test_sequence_by_folder_and_glob_in_the_order_of_numbers(tmp_path: Path) -> 
         assert source.metadata.notes == ()
         assert source.metadata.pixel_size_pm == 10.0
         assert [file.name for file in source.files[8:11]] == ["frame_8.tif", "frame_9.tif", "frame_10.tif"]
+
+
+def test_a_path_that_exists_is_no_pattern_and_a_folder_is_taken_as_it_is_written(tmp_path: Path) -> None:
+    for folder, value in (("scan [2]", 2), ("scan 2", 22)):
+        (tmp_path / folder).mkdir()
+        for name in ("f_1.npy", "f[1].npy"):
+            np.save(tmp_path / folder / name, np.full((1, N_Y, N_X), value if name == "f_1.npy" else 1, np.uint8))
+    assert open_source(tmp_path / "scan [2]" / "f_*.npy").read(0, 1)[0, 0, 0] == 2
+    assert open_source(tmp_path / "scan [2]").shape[0] == 2
+    assert open_source(tmp_path / "scan [2]" / "f[1].npy").read(0, 1)[0, 0, 0] == 1
+    (tmp_path / "scan [2]" / ".f_1.npy").write_bytes(b"hidden")
+    assert open_source(tmp_path / "scan [2]" / "*.npy").shape[0] == 2
+    for pattern in ("scan ?/f_*.npy", "sca*/f_1.npy", "**/f_1.npy", "*/f_*.npy"):
+        with pytest.raises(SourceError, match="there is no such f"):
+            open_source(tmp_path / pattern)
+
+
+def test_a_list_of_files_is_opened_as_it_is_and_each_is_permitted_first(tmp_path: Path) -> None:
+    for number in range(4):
+        np.save(tmp_path / f"f_{number}.npy", np.full((1, N_Y, N_X), number, np.uint8))
+    (tmp_path / "link.npy").symlink_to("f_3.npy")
+    files = FileList(f"{tmp_path}/f_*.npy", tuple(tmp_path / name for name in ("f_1.npy", "f_2.npy", "link.npy")))
+    asked: list[Path] = []
+    source = open_source(files, permit=asked.append)
+    assert source.path == f"{tmp_path}/f_*.npy"
+    assert asked == [tmp_path / f"f_{number}.npy" for number in (1, 2, 3)]
+    assert source.read(0, 3)[:, 0, 0].tolist() == [1, 2, 3]
+    assert open_cached(files) is open_cached(files)
+
+    def refuse(path: Path) -> None:
+        if path.name == "f_3.npy":
+            raise SourceError("refused", str(path))
+
+    for name in (tmp_path / "link.npy", tmp_path / "f_*.npy", files):
+        with pytest.raises(SourceError, match="refused"):
+            open_source(name, permit=refuse)
 
 
 def test_sequence_of_stacks_and_of_other_formats(tmp_path: Path) -> None:

@@ -9,43 +9,54 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tract_dask"
 
 GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"journal", "provenance", "shards", "stores"}
-MOVIE = STORES | {"io", "movie", "kernels"}
+STORES = GROUND | {"damage", "disk", "journal", "keyed", "provenance", "shards", "stamps", "stores"}
+MOVIE = STORES | {"io", "movie", "kernels", "pixel_range", "processor"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
-RUN = STAGES | {"cluster", "stages", "pipeline", "tasks", "tls"}
+RUN = STAGES | {"cluster", "dispatch", "stages", "pipeline", "tasks", "tls"}
 
 ALLOWED = {
     "errors": set(),
     "lazy": set(),
+    "system": {"errors"},
     "progress": set(),
     "schema": {"errors"},
     "settings": {"errors"},
-    "provenance": {"settings"},
-    "stores": {"errors", "schema"},
+    "keyed": {"settings"},
+    "processor": {"kernels"},
+    "provenance": {"keyed", "processor", "settings"},
+    "stamps": {"errors"},
+    "disk": set(),
+    "stores": {"damage", "disk", "errors", "schema", "shard_files"},
+    "damage": {"errors"},
     "shards": set(),
-    "journal": {"shards", "stores"},
-    "tasks": {"errors", "journal", "shards"},
+    "journal": {"disk", "errors", "shard_files", "shards", "stores"},
+    "tries": {"errors"},
+    "deaths": set(),
+    "dispatch": {"deaths", "errors", "journal", "shards", "tries"},
+    "tasks": {"dispatch", "errors", "journal", "progress", "shards", "tries"},
     "kernels": set(),
     "io": STORES,
-    "shard_files": set(),
+    "shard_files": {"disk"},
     "layout": {"settings", "kernels", "shard_files"},
     "ome": {"schema", "stores"},
     "movie": STORES | {"kernels", "ome", "shard_files"},
     "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files", "tasks"},
-    "passes": STORES | {"movie", "tasks"},
+    "passes": STORES | {"movie", "shard_files", "tasks"},
     "lattice": {"kernels"},
     "seeds": GROUND,
     "windows": {"errors"},
     "vacuum": GROUND | {"kernels"},
+    "pixel_range": {"errors"},
     "filtering": MOVIE,
     "measure": MOVIE | {"filtering"},
-    "results": STORES | {"shard_files"},
+    "parts": STORES | {"shard_files", "tasks"},
+    "results": STORES | {"parts", "shard_files"},
     "plots": MOVIE | {"analysis", "lazy", "results", "seeds"},
     "drift": MOVIE | {"passes"},
     "summing": MOVIE | {"passes"},
     "detection": MOVIE | {"lattice", "passes", "seeds", "windows"},
     "columns": MOVIE | {"detection", "lattice", "seeds", "windows"},
-    "fit": MOVIE | {"measure", "results", "tasks", "vacuum", "windows"},
+    "fit": MOVIE | {"measure", "parts", "results", "tasks", "vacuum", "windows"},
     "comparison": MOVIE | {"filtering", "fit", "measure", "plots"},
     "dose": MOVIE | {"fit", "shard_files"},
     "analysis": MOVIE | {"columns", "measure", "results", "seeds", "vacuum", "windows"},
@@ -53,26 +64,29 @@ ALLOWED = {
     "figures": MOVIE | {"analysis", "comparison", "dose", "plots", "results"},
     "simulate": GROUND | {"analysis", "kernels", "lazy", "seeds", "stores", "windows"},
     "tls": {"certificates", "errors"},
-    "slurm": {"errors", "forkserver", "settings", "tls"},
+    "slurm": {"deaths", "errors", "forkserver", "settings", "tls"},
     "supervision": set(),
-    "ssh": {"errors", "forkserver", "settings", "supervision", "tls"},
+    "ssh": {"deaths", "errors", "forkserver", "settings", "supervision", "tls"},
     "dask_dashboard": set(),
-    "cluster": {"dask_dashboard", "errors", "settings", "forkserver", "slurm", "ssh", "tasks", "tls"},
+    "cluster": {"dask_dashboard", "deaths", "dispatch", "errors", "settings", "forkserver", "slurm", "ssh", "tls"},
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
     "stages": STAGES,
+    "verify": STORES | {"conversion", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "web", "windows"},
-    "pipeline": STAGES | {"cluster", "report", "stages"},
+    "pipeline": STAGES | {"cluster", "report", "stages", "tls"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "editor": RUN | {"service"},
     "options": {"settings"},
     "console": {"options"},
+    "interrupts": set(),
+    "program": {"cli", "interrupts"},
     "certificates": {"errors"},
     "service": RUN
-    | {"analysis", "certificates", "describe", "export", "forkserver", "lazy"}
-    | {"meter", "report", "supervision", "terminal", "web"},
+    | {"parts", "analysis", "certificates", "describe", "export", "forkserver", "lazy"}
+    | {"meter", "report", "shard_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},
@@ -80,7 +94,8 @@ ALLOWED = {
     "terminal": {"meter", "progress"},
     "cli": RUN
     | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "lazy", "options", "remote", "report", "simulate", "terminal"},
+    | {"console", "editor", "hosting", "interrupts", "lazy", "options", "remote", "report", "simulate", "system"}
+    | {"terminal", "verify"},
 }
 """What each room (a file or a folder of the package) may import from the others."""
 

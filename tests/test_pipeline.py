@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import errno
+import os
 import shutil
 import tomllib
 from pathlib import Path
@@ -13,7 +15,7 @@ from conftest import Scene
 from distributed import Client, LocalCluster
 
 from tract_dask import cluster, pipeline, settings, stores
-from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError
+from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError, StoreError
 from tract_dask.progress import REPORT, STAGES, RunDone, RunStarted, StageDone, StageStarted, Warned
 from tract_dask.results import open_results
 from tract_dask.settings import ConvertSettings, RunSettings
@@ -125,7 +127,6 @@ def test_second_run_does_nothing_and_starts_no_cluster(done, scene, monkeypatch)
         ({"columns": {"search_radius_px": 0.0}}, {"columns"}),
         ({"drift": {"method": "none"}}, {"drift", "sum", "columns", "fit"}),
         ({"metadata": {"gain": 2.0}}, {"sum", "columns", "fit"}),
-        ({"convert": {"codec": "zstd"}}, {"convert", "drift", "sum", "fit"}),
         ({"cluster": {"workers": 1}}, set()),
     ],
 )
@@ -156,17 +157,6 @@ def test_edited_columns_are_kept_and_fitted_anew(done, scene):
     assert file.read_text() == edited
     assert done().reused == STAGES
     assert done.of(Warned) == []
-
-
-def test_edited_columns_are_put_away_where_new_settings_replace_them(done):
-    file = done.output / "columns.csv"
-    lines = file.read_text().splitlines()
-    edited = "\n".join([lines[0], *lines[2:]]) + "\n"
-    file.write_text(edited)
-    done()
-    done(change(columns={"min_amplitude": 0.2}))
-    assert len(table(file)) == len(lines) - 1
-    assert file.with_stem("columns-edited").read_text() == edited
 
 
 def test_interrupted_and_failed_runs_go_on_to_the_same_result(base, done, monkeypatch):
@@ -331,3 +321,19 @@ def test_what_cannot_fit_the_movie_is_refused_before_any_work(job, tmp_path, col
         job(change(columns=columns, fit=fit))
     assert job.events == []
     assert not job.output.exists()
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EMFILE])
+def test_an_error_of_the_system_in_the_driver_is_one_of_ours(job, monkeypatch, number):
+    def fails(*args, **more):
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(pipeline, "sum_stage", fails)
+        with pytest.raises(StoreError) as caught:
+            job()
+    assert str(job.output) in str(caught.value)
+    assert os.strerror(number) in str(caught.value)
+    assert "run the same command again" in str(caught.value)
+    assert job.of(RunDone)[-1].state == "failed"
+    assert job().state == "done"

@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import xarray as xr
-from conftest import Scene
+from conftest import Scene, store_fits
 from matplotlib import colormaps
 
 from tract_dask import results, schema, stores
@@ -22,7 +22,6 @@ from tract_dask.report.survey import column_series, survey
 from tract_dask.schema import Status
 from tract_dask.service.api.results import _REPORT_POLICY
 from tract_dask.settings import FitSettings, RunSettings, to_toml
-from tract_dask.shards import Shard
 
 N_FRAMES, ERROR_PX, PIXEL_PM = 40, 0.5, 4.0
 WAIT_MS = 15_000
@@ -93,8 +92,7 @@ class Run:
             **self.about,
         )
         stored = {name: values for name, values in self.values.items() if name not in ("time", "drift_measured")}
-        results.write(path, Shard(0, 0, N_FRAMES), stored, N_FRAMES)
-        stores.update_attributes(path, complete=True)
+        store_fits(path, stored, N_FRAMES)
         summed = self.scene.summed()
         summed.attrs = {"pixel_size_pm": self.about["pixel_size_pm"]} if self.about["pixel_size_pm"] else {}
         stores.write_dataset(summed, self.folder / "sum.zarr")

@@ -13,7 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 from serviced import FRAMES, listening, make_app, make_root
 
-from tract_dask.pipeline import Outputs, plan_run
+from tract_dask.pipeline import plan_run
 from tract_dask.service import feed as feeding
 from tract_dask.service import planning
 from tract_dask.service.entrance.access import Access
@@ -175,52 +175,6 @@ def test_a_folder_is_one_jobs_at_a_time(api):
     assert second["id"] in answer.json()["error"]["text"]
 
 
-def test_the_files_of_a_job_go_with_it_if_they_are_its_own(api, root):
-    def written(job: dict, *more: str) -> Path:
-        outputs = Outputs(root / job["output"])
-        outputs.root.mkdir(parents=True, exist_ok=True)
-        for path in (outputs.settings, outputs.columns, *(outputs.root / name for name in more)):
-            path.write_text("x")
-        outputs.results.mkdir()
-        return outputs.root
-
-    def delete(job: dict) -> dict:
-        api.post(f"jobs/{job['id']}/cancel")
-        return api.delete(f"jobs/{job['id']}", params={"files": True}).json()
-
-    own, named = submit(api), submit(api, output="named")
-    folder, named_folder = written(own, "note.txt"), written(named, "note.txt")
-    assert delete(own)["files"]
-    assert not folder.exists()
-    assert delete(named)["files"]
-    assert [path.name for path in named_folder.iterdir()] == ["note.txt"]  # nobody's but the user's
-
-    shared = submit(api, output="shared")
-    folder = written(shared)
-    api.post(f"jobs/{shared['id']}/cancel")
-    inner = submit(api, output="shared/below")
-    answer = delete(shared)
-    assert not answer["files"]
-    assert inner["id"] in answer["kept"]
-    assert (folder / "run.toml").exists()
-
-    (root / "precious").mkdir()
-    (root / "precious" / "run.toml").write_text("x")
-    linked = submit(api)
-    (root / "jobs").mkdir(exist_ok=True)
-    (root / linked["output"]).symlink_to(root / "precious")
-    assert "link" in delete(linked)["kept"]
-    assert (root / "precious" / "run.toml").exists()
-
-    other = submit(api, output="run")
-    written(other)
-    store = root / "run" / "movie.zarr"
-    store.mkdir()
-    (store / "zarr.json").write_text(json.dumps({"attributes": {"tract_dask": {"source": "/elsewhere/movie.tif"}}}))
-    if "another movie" not in delete(other)["kept"]:
-        pytest.fail("the run of another movie was deleted")
-
-
 def test_a_plan_is_that_of_the_run(api, root, monkeypatch):
     settings = {"convert": {"shard_mb": 1.0}}
     plan = api.post("plan", json={"source": "movie.npy", "settings": settings}).json()
@@ -304,6 +258,10 @@ def test_workers_are_those_that_the_keeper_sees(api, monkeypatch):
     assert api.get("workers").json()["workers"] == [worker]
 
 
+KEEPS_NOTHING = ("refine", "lattice")
+"""Routes of a job that compute from what they are sent, and change nothing."""
+
+
 def test_jobs_of_others_are_seen_and_left_alone(root):
     app = make_app(root, tokens=True)
     access: Access = app.state.access
@@ -315,9 +273,23 @@ def test_jobs_of_others_are_seen_and_left_alone(root):
     assert job["owner"] == "ana"
     place = f"jobs/{job['id']}"
     assert clients["ben"].get(place).status_code == 200
-    for method, route in [("POST", "/cancel"), ("POST", "/retry"), ("POST", "/label"), ("DELETE", "")]:
-        answer = clients["ben"].request(method, place + route, json={"label": "x"} if route == "/label" else None)
-        assert answer.status_code == 403, route
+    before = app.state.store.job(job["id"]).to_record()
+    changing = 0
+    for route, operations in app.openapi()["paths"].items():
+        for method in operations:
+            if method == "get" or "{job_id}" not in route or route.rpartition("/")[2] in KEEPS_NOTHING:
+                continue
+            changing += 1
+            body = {"label": "x", "version": 0, "columns": [{"x": 1, "y": 1}]}
+            for fields in ({"label"}, {"version"}, {"columns"}):
+                url = f"http://127.0.0.1:8000{route.replace('{job_id}', job['id'])}"
+                answer = clients["ben"].request(method, url, json={name: body[name] for name in fields})
+                assert answer.status_code in (403, 422), (method, route, answer.text)
+                if answer.status_code == 403:
+                    break
+            assert "belongs to someone else" in answer.text, (method, route)
+    assert changing >= 6
+    assert app.state.store.job(job["id"]).to_record() == before
     assert clients["root"].post(f"{place}/cancel").json()["reason"] == "cancelled by root"
     assert clients["ana"].delete(place).status_code == 200
 
@@ -364,7 +336,7 @@ class Listener:
         self.ended.set()
 
     def wait_for(self, count: int) -> list:
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while len(self.events) < count and time.monotonic() < deadline:
             time.sleep(0.01)
         assert len(self.events) >= count, self.events
@@ -386,7 +358,8 @@ def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
         store.log(other["id"], "info", "of another job")
         for k in range(5):
             store.progress(first["id"], {"stage": "fit", "done_frames": k})
-            time.sleep(0.25)  # only the newest is kept: let each be seen
+            listener.wait_for(3 + k)  # only the newest is kept: let each be seen
+            everything.wait_for(5 + k)
         store.log(first["id"], "info", "line\nwith an end")
         seen = listener.wait_for(8)[1:]
         assert [kind for _, kind, _ in seen] == ["job", *["progress"] * 5, "log"]
@@ -410,8 +383,8 @@ def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
         assert resumed.wait_for(5)[-1][1:] == ("job", {"id": first["id"], "deleted": True})
         began = time.monotonic()
         app.state.feed.close()
-        assert all(one.ended.wait(2) for one in (listener, everything, resumed, stranger))
-        assert time.monotonic() - began < 1.5
+        assert all(one.ended.wait(10) for one in (listener, everything, resumed, stranger))
+        assert time.monotonic() - began < 10  # not with the next heartbeat
 
 
 def test_a_stream_of_a_revoked_token_ends(root):

@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from tract_dask.errors import InputError, MissingStoreError
+from tract_dask.io import FileList
 from tract_dask.service.app import create_app
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.folders import DataRoot, OutsideError
@@ -118,8 +119,9 @@ def test_what_lies_inside_is_found(root):
     assert data.relative(real / "folder" / "inner.mrc") == "folder/inner.mrc"
     assert data.relative(real) == ""
     assert data.source("movie.tif::/a/b") == f"{real}/movie.tif::/a/b"
-    assert data.source("clean") == f"{real}/clean"
-    assert data.source("clean/*.tif") == f"{real}/clean/*.tif"
+    frames = (real / "clean" / "f1.tif",)
+    assert data.source("clean") == FileList(f"{real}/clean", frames)
+    assert data.source("clean/*.tif") == FileList(f"{real}/clean/*.tif", frames)
     with pytest.raises(OutsideError):
         data.relative(real.parent / "secret.tif")
     with pytest.raises(MissingStoreError, match="no such file"):

@@ -14,12 +14,12 @@ import pandas as pd
 import pytest
 import xarray as xr
 import zarr.storage
+from conftest import add_fits, store_fits
 from fastapi.testclient import TestClient
 from serviced import Here, make_app
 
 from tract_dask import open_results, results, schema, stores
 from tract_dask.analysis import motion
-from tract_dask.journal import Journal, journal_beside
 from tract_dask.provenance import provenance
 from tract_dask.schema import Status
 from tract_dask.service.data import exports, track_cache, tracks
@@ -79,17 +79,10 @@ class Fits:
         )
 
     def write(self, *indices: int, record: bool = True) -> None:
-        journal = Journal(journal_beside(self.path), KEY)
-        for shard in (self.shards[k] for k in indices):
-            part = {name: values[shard.start : shard.stop] for name, values in self.known.items()}
-            results.write(self.path, shard, part, STEP)
-            if record:
-                journal.record(shard, {})
+        add_fits(self.path, self.known, [self.shards[k] for k in indices], STEP, KEY, record)
 
     def finish(self) -> None:
-        self.write(*range(len(self.shards)))
-        stores.update_attributes(self.path, complete=True)
-        stores.remove(journal_beside(self.path))
+        store_fits(self.path, self.known, STEP, KEY)
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import zarr
-from zarr.codecs import BloscCodec
 
-from tract_dask.shard_files import BLOSC, Grid, ShardReader, ShardWriter, shard_path
+from tract_dask.shard_files import BLOSC, CHUNK_KEYS, Grid, ShardReader, ShardWriter, chunk_path, codecs
 
 GRID = Grid(shape=(13, 30, 44), chunk=(3, 16, 15), shard=(6, 32, 45))
 CODECS = ["lz4", "zstd", "none"]
@@ -22,20 +21,21 @@ def zarr_array(path, dtype, codec):
         chunks=GRID.chunk,
         shards=GRID.shard,
         dtype=dtype,
-        compressors=BloscCodec(**BLOSC[codec]) if codec in BLOSC else None,
+        compressors=codecs(codec),
+        chunk_key_encoding=CHUNK_KEYS,
         fill_value=0,
     )
 
 
 def write(path, frames, codec):
     for number, start in enumerate(range(0, len(frames), GRID.shard[0])):
-        with ShardWriter(shard_path(path, number), path, GRID, frames.dtype, codec) as writer:
+        with ShardWriter(chunk_path(path, number, 0, 0), path, GRID, frames.dtype, codec) as writer:
             for frame in frames[start : start + GRID.shard[0]]:
                 writer.add(frame)
 
 
 def reader(path, number, dtype, codec):
-    return ShardReader(shard_path(path, number), GRID, np.dtype(dtype), encoded=codec in BLOSC)
+    return ShardReader(chunk_path(path, number, 0, 0), GRID, np.dtype(dtype), encoded=codec in BLOSC)
 
 
 @pytest.mark.parametrize("codec", CODECS)
@@ -51,7 +51,6 @@ def test_zarr_reads_what_is_written(tmp_path, dtype, codec):
 @pytest.mark.parametrize("codec", CODECS)
 def test_what_zarr_writes_is_read(tmp_path, codec):
     frames = frames_of()
-    frames[6:9, :16] = 0  # tiles that Zarr does not store
     zarr_array(tmp_path / "0", "u2", codec)[...] = frames
     for number, start in enumerate((0, 6, 12)):
         stop = min(6, 13 - start)
@@ -61,9 +60,38 @@ def test_what_zarr_writes_is_read(tmp_path, codec):
         np.testing.assert_array_equal(out, frames[start : start + stop, 12:21, 14:44])
 
 
+def test_a_tile_that_is_not_stored_is_an_error(tmp_path):
+    frames = frames_of()
+    frames[6:9, :16] = 0  # tiles that Zarr does not store
+    zarr_array(tmp_path / "0", "u2", "lz4")[...] = frames
+    out = np.empty((3, 30, 44), np.uint16)
+    with (
+        reader(tmp_path / "0", 1, "u2", "lz4") as shard,
+        pytest.raises(ValueError, match=r"tile \(0, 0, 0\) is missing"),
+    ):
+        shard.read((slice(0, 3), slice(0, 30), slice(0, 44)), out)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("seed", range(12))
+def test_every_flipped_bit_of_a_tile_is_seen_by_us_and_by_zarr(tmp_path, codec, seed):
+    frames = frames_of()
+    zarr_array(tmp_path / "0", "u2", codec)
+    write(tmp_path / "0", frames, codec)
+    path = chunk_path(tmp_path / "0", 0, 0, 0)
+    rng, data = np.random.default_rng(seed), bytearray(path.read_bytes())
+    data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+    path.write_bytes(data)
+    out = np.empty((6, 30, 44), np.uint16)
+    with pytest.raises(ValueError, match=r"is damaged"), reader(tmp_path / "0", 0, "u2", codec) as shard:
+        shard.read((slice(0, 6), slice(0, 30), slice(0, 44)), out)
+    with pytest.raises(ValueError, match=r"(?i)checksum"):
+        zarr.open_array(str(tmp_path / "0"), mode="r")[:6]
+
+
 def test_an_error_leaves_no_file(tmp_path):
     def fail():
-        with ShardWriter(shard_path(tmp_path, 0), tmp_path, GRID, np.dtype("u2"), "lz4") as writer:
+        with ShardWriter(chunk_path(tmp_path, 0, 0, 0), tmp_path, GRID, np.dtype("u2"), "lz4") as writer:
             writer.add(frames_of()[0])
             raise ZeroDivisionError
 
@@ -75,7 +103,7 @@ def test_an_error_leaves_no_file(tmp_path):
 @pytest.mark.parametrize("codec", CODECS)
 def test_damage_is_told(tmp_path, codec):
     write(tmp_path, frames_of(), codec)
-    path = shard_path(tmp_path, 0)
+    path = chunk_path(tmp_path, 0, 0, 0)
     data = path.read_bytes()
     path.write_bytes(data[:-30] + b"x" + data[-29:])
     with pytest.raises(ValueError, match="index at the end"), reader(tmp_path, 0, "u2", codec):
@@ -83,11 +111,10 @@ def test_damage_is_told(tmp_path, codec):
     path.write_bytes(data[:50])
     with pytest.raises(ValueError, match="index at the end"), reader(tmp_path, 0, "u2", codec):
         pass
-    if codec != "none":
-        path.write_bytes(bytes(200) + data[200:])
-        out = np.empty(GRID.chunk, np.uint16)
-        with reader(tmp_path, 0, "u2", codec) as shard, pytest.raises(ValueError, match=r"tile .* is damaged"):
-            shard.read_tile(0, 0, 0, out)
+    path.write_bytes(bytes(200) + data[200:])
+    out = np.empty(GRID.chunk, np.uint16)
+    with reader(tmp_path, 0, "u2", codec) as shard, pytest.raises(ValueError, match=r"tile .* is damaged"):
+        shard.read_tile(0, 0, 0, out)
 
 
 def test_a_missing_file_is_told(tmp_path):

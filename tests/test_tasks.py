@@ -6,14 +6,15 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, LocalCluster
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tract_dask import tasks
+from tract_dask import dispatch, tasks
 from tract_dask.errors import ClusterError, StoreError
 from tract_dask.journal import Journal
 from tract_dask.shards import Shard, split
@@ -100,7 +101,7 @@ def test_a_batch_ends_when_its_time_is_up(tmp_path, monkeypatch):
 
 
 def test_what_a_batch_leaves_comes_first_again():
-    queue = tasks._Queue(np.arange(10))
+    queue = dispatch.Todo(np.arange(10))
     batch = queue.take(6)
     queue.give_back(batch[2:])
     assert queue.left == 8
@@ -141,7 +142,7 @@ def test_whoever_takes_the_payloads_may_stop_the_work(cluster, tmp_path):
 
 
 def test_a_cluster_that_loses_all_its_workers_is_given_up(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr(tasks, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(dispatch, "_PATIENCE_S", 1.0)
     journal = Journal(tmp_path / "journal", "key")
 
     def leave():
@@ -156,15 +157,15 @@ def test_a_cluster_that_loses_all_its_workers_is_given_up(cluster, tmp_path, mon
 
 
 def test_a_result_that_its_worker_took_along_is_not_waited_for(cluster, tmp_path, monkeypatch):
-    class Leaving(as_completed):
-        def __next__(self):
-            future = super().__next__()
+    class Leaving(SimpleQueue):
+        def get(self, *args, **kwargs):
+            future = super().get(*args, **kwargs)
             cluster.scale(0)
             while future.client.nthreads():
                 time.sleep(0.01)
             return future
 
-    monkeypatch.setattr(tasks, "_PATIENCE_S", 1.0)
-    monkeypatch.setattr(tasks, "as_completed", Leaving)
+    monkeypatch.setattr(dispatch, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(dispatch, "SimpleQueue", Leaving)
     with Client(cluster) as client, pytest.raises(ClusterError, match="without a worker"):
         run_shards(wait_long, split(10, 1), journal=Journal(tmp_path / "journal", "key"), name="wait", client=client)

@@ -94,3 +94,10 @@ def test_nan_spreads_and_wrong_input_is_refused():
     np.testing.assert_allclose(wiener(np.full((6, 7), 3.0)), 3.0, rtol=1e-6)
     with pytest.raises(ValueError, match="cutoff must be"):
         wiener(np.zeros((4, 4)), 1.0, 0.0)
+
+
+@pytest.mark.parametrize("factor", [2.0**-90, 2.0**90])
+def test_the_units_of_the_pixels_do_not_matter(factor):
+    image = lattice((96, 100)) + white_noise((96, 100))
+    found = wiener((image * factor).astype(np.float32))
+    np.testing.assert_array_equal(found, wiener(image) * np.float32(factor))

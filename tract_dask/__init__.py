@@ -5,9 +5,11 @@ The public names are imported when they are first used, so that ``import tract_d
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, Any
 
 from .lazy import lazy_names
+from .system import check_system
 
 if TYPE_CHECKING:
     from .client import ServiceClient
@@ -75,5 +77,18 @@ __all__ = [
     "sum_image",
 ]
 
+_find, __dir__ = lazy_names(__name__, _ROOMS)
 
-__getattr__, __dir__ = lazy_names(__name__, _ROOMS)
+
+def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        check_system()
+    return _find(name)
+
+
+if sys.platform == "win32":
+    import warnings
+
+    warnings.warn(
+        "tract_dask does not run on Windows: install and run it in WSL, the Linux inside Windows", stacklevel=2
+    )

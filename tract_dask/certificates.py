@@ -103,6 +103,22 @@ def make_certificates(folder: Path, hosts: Sequence[str] = (), *, days: int = 82
         ) from error
 
 
+def temporary_pair(days: int = 365) -> tuple[str, str]:
+    """Return a certificate that has signed itself, for one cluster, and its key, as PEM texts.
+
+    Who trusts nothing else takes only connections of those who hold this key.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "tract_dask temporary")])
+    now = datetime.now(UTC)
+    made = (
+        _builder(name, name, key.public_key(), now, now + timedelta(days=days))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName("tract-dask-temporary")]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return made.public_bytes(serialization.Encoding.PEM).decode(), _key_text(key).decode()
+
+
 def check_certificates(folder: Path, name: str = SERVICE) -> Certificate:
     """Return the certificate ``name`` of a folder, once it and its key are found to be readable, in time, and a pair.
 
@@ -294,11 +310,15 @@ def _read_key(path: Path) -> ec.EllipticCurvePrivateKey:
     return found
 
 
+def _key_text(key: ec.EllipticCurvePrivateKey) -> bytes:
+    plain = serialization.NoEncryption()
+    return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain)
+
+
 def _write(path: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
     """Write the key, then the certificate, each aside and then renamed; a key is never readable by others."""
-    pem = serialization.Encoding.PEM
-    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    for place, data, mode in ((_key_path(path), secret, 0o600), (path, certificate.public_bytes(pem), 0o644)):
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    for place, data, mode in ((_key_path(path), _key_text(key), 0o600), (path, public, 0o644)):
         aside = place.with_name(f".{place.name}.{os.getpid()}.partial")
         with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)

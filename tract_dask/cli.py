@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
+from . import interrupts
 from .console import DEBUG, PATH, Subgroup, common_options, show
 from .errors import TractError
 from .hosting import certs, serve, token
@@ -30,6 +31,7 @@ from .progress import STAGES
 from .remote import cancel, jobs, submit, watch
 from .settings import RunSettings
 from .simulate.settings import PRESETS, Microscope, SpecimenSettings
+from .system import check_system
 
 if TYPE_CHECKING:
     from .pipeline import Plan, RunOutcome
@@ -37,8 +39,8 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-FAILED, BAD_FRAMES, INTERRUPTED = 1, 3, 130
-"""Exit codes beside 0, and 2 for usage or bad input."""
+FAILED, BAD_FRAMES = 1, 3
+"""Exit codes beside 0, 2 for usage or bad input, and that of an interrupt."""
 
 
 class Group(click.Group):
@@ -53,11 +55,12 @@ class Group(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; turn what it raises into an exit code."""
         try:
+            check_system()
             with _terminated_as_interrupted():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            click.echo("Interrupted: what is done is kept, and the same command goes on from there.", err=True)
-            ctx.exit(INTERRUPTED)
+            click.echo(interrupts.SENTENCE, err=True)
+            ctx.exit(interrupts.CODE)
         except (click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except TractError as error:
@@ -201,6 +204,29 @@ def fit(
         summary = pipeline.run_fit(movie, columns, results, settings, drift_from, on_event=on_event)
     _show_store(results, as_json=as_json)
     _exit_for(summary.bad_frames)
+
+
+@main.command()
+@click.argument("path", type=PATH, metavar="OUTPUT")
+@click.option("--repair", is_flag=True, help="Then make what is damaged in a movie anew, from its source.")
+@common_options
+def verify(path: Path, *, repair: bool, as_json: bool) -> None:
+    """Read all that the run in the folder OUTPUT wrote, and name what is damaged or missing.
+
+    OUTPUT may also be a single store (.zarr). The exit code is 0 where all is sound, and 1 where it is not.
+    """
+    from . import verify as verifying
+
+    with _progress() as on_event:
+        found = verifying.verify(path, on_event)
+        if repair and verifying.repair(found, on_event):
+            found = verifying.verify(path, on_event)
+    if as_json:
+        click.echo(json.dumps(found.to_record()))
+    else:
+        click.echo(found.text())
+    if not found.sound:
+        click.get_current_context().exit(FAILED)
 
 
 @main.command("compare-filters")
@@ -524,11 +550,14 @@ def command() -> NoReturn:
     To take apart all that was imported takes Python a second or more, and nothing depends on it: what was written is on
     disk, the workers are gone, and their server ends with this process.
     """
+    interrupts.install()
     code: object = 0
     try:
         main()
     except SystemExit as ended:
         code = ended.code
+    except KeyboardInterrupt:  # just before a command has begun, or after its end
+        interrupts.end_at_once()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # whoever read it may be gone
             stream.flush()

@@ -20,6 +20,7 @@ from time import monotonic, sleep
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import httpcore  # noqa: F401  httpx would import it with its first client, which two threads may make at once
 import httpx
 
 from . import errors

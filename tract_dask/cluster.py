@@ -18,16 +18,20 @@ from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 from distributed.system import MEMORY_LIMIT
 
-from . import dask_dashboard, forkserver
+from . import dask_dashboard, deaths, forkserver
+from .dispatch import PATIENCE, patience_s
 from .errors import ClusterError, SettingsError
 from .settings import ClusterSettings
-from .tasks import PATIENCE, patience_s
-from .tls import checked_address, security, worker_flags
+from .tls import Credentials, checked_address, in_memory, security, temporary_credentials, worker_flags
 
 PACKAGE = "tract_dask"
 
 _NANNY_ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
+_LOST_WORKER = "distributed.deploy.lost-worker-timeout"
 _PROCESS_METHOD = "distributed.worker.multiprocessing-method"
+
+_TOLD_OF_DEATHS = {"distributed.scheduler.allowed-failures": 0, "distributed.nanny.preload": [deaths.MODULE]}
+"""How a cluster is configured that reports each death of a worker: the loop over shards judges them itself."""
 
 
 @contextmanager
@@ -61,27 +65,33 @@ def connect(settings: ClusterSettings | None = None, *, timeout_s: float = 10.0)
 
 
 @contextmanager
-def hold(settings: ClusterSettings) -> Iterator[Any]:
+def hold(settings: ClusterSettings, credentials: Credentials | None = None) -> Iterator[Any]:
     """Yield a running cluster (:class:`distributed.deploy.Cluster`) of any kind but address; it ends with the block.
+
+    Parameters
+    ----------
+    credentials
+        For a local cluster without certificates, instead of new ones.
 
     Raises
     ------
     ClusterError
         Where it does not come up.
     """
-    if settings.resolved_kind == "slurm":
-        from .slurm import hold_slurm  # an extra
+    with dask.config.set(_TOLD_OF_DEATHS):
+        if settings.resolved_kind == "slurm":
+            from .slurm import hold_slurm  # an extra
 
-        with hold_slurm(settings, memory_limit(settings)) as cluster:
-            yield cluster
-    elif settings.resolved_kind == "ssh":
-        from .ssh import hold_ssh
+            with hold_slurm(settings, memory_limit(settings)) as cluster:
+                yield cluster
+        elif settings.resolved_kind == "ssh":
+            from .ssh import hold_ssh
 
-        with hold_ssh(settings, memory_limit(settings)) as cluster:
-            yield cluster
-    else:
-        with _hold_local(settings) as cluster:
-            yield cluster
+            with hold_ssh(settings, memory_limit(settings)) as cluster:
+                yield cluster
+        else:
+            with _hold_local(settings, credentials) as cluster:
+                yield cluster
 
 
 class LazyClient:
@@ -220,9 +230,15 @@ def memory_limit(settings: ClusterSettings) -> int | None:
 
 
 @contextmanager
-def _hold_local(settings: ClusterSettings) -> Iterator[LocalCluster]:
-    """Start workers of one thread each, if not set otherwise, whose libraries use one thread each."""
-    changes: dict[str, Any] = {_NANNY_ENVIRONMENT: dict(dask.config.get(_NANNY_ENVIRONMENT)) | forkserver.ENVIRONMENT}
+def _hold_local(settings: ClusterSettings, credentials: Credentials | None) -> Iterator[LocalCluster]:
+    """Start workers of one thread each, if not set otherwise, whose libraries use one thread each.
+
+    What listens speaks TLS: the loopback is open to every user of the machine, and Dask runs what it is sent.
+    """
+    changes: dict[str, Any] = {
+        _NANNY_ENVIRONMENT: dict(dask.config.get(_NANNY_ENVIRONMENT)) | forkserver.ENVIRONMENT,
+        _LOST_WORKER: "1000 days",  # its nanny starts another; one that died twice in 15 s would not be replaced
+    }
     if forkserver.AVAILABLE:
         changes[_PROCESS_METHOD] = "forkserver"
     forkserver.start()
@@ -234,8 +250,8 @@ def _hold_local(settings: ClusterSettings) -> Iterator[LocalCluster]:
                 threads_per_worker=settings.threads,
                 memory_limit=local_memory_limit(settings),
                 processes=True,
-                protocol="tls://" if settings.tls else "tcp://",
-                security=security(settings.tls),
+                protocol="tls://",
+                security=security(settings.tls) or in_memory(credentials or temporary_credentials()),
                 local_directory=settings.local_directory,
                 dashboard_address="127.0.0.1:8787",
                 scheduler_kwargs=dask_dashboard.LATER,

@@ -15,6 +15,7 @@ from .detection import METHODS, make_detector
 from .errors import InputError, SettingsError
 from .kernels.filters import cut_windows
 from .kernels.fitting import GaussianFits, fit_gaussians
+from .kernels.magnitude import unit_of
 from .kernels.peaks import centroids, climb
 from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .schema import Status
@@ -40,7 +41,10 @@ _FEWEST_FOR_SHAPE = 5
 
 @dataclass(frozen=True)
 class _Scene:
-    """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``."""
+    """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``.
+
+    A pixel is a number of ``unit`` counts.
+    """
 
     counts: NDArray[np.float64]
     image: NDArray[np.float64]
@@ -48,6 +52,7 @@ class _Scene:
     sign: int
     noise: float
     blur_sigma_px: float
+    unit: float
 
     def lattice(self, spacing_px: float | None = None) -> Lattice | None:
         return find_lattice(self.image, self.valid, self.noise, self.blur_sigma_px, spacing_px)
@@ -126,6 +131,7 @@ def find_columns(
     inside, corner = _corners(places, window, scene.valid)
     places = np.where(inside[:, None], places, found.places)
     fit, status = _fit(scene, places, corner, inside, found.kind, window, max(search, 1.0))
+    fit[:, [AMPLITUDE, BACKGROUND]] *= scene.unit
     if seeds is not None and "share" in seeds:
         fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
     fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
@@ -157,8 +163,10 @@ def _scene(summed: xr.Dataset, settings: ColumnSettings, blur_sigma_px: float) -
         )
     if not valid.all():
         counts = np.where(valid, counts, np.median(sample(counts[valid])))
+    unit = unit_of(counts)
+    counts = counts if unit == 1 else counts / unit
     image, sign = (counts, 1) if settings.contrast == "bright" else (-counts, -1)
-    return _Scene(counts, image, valid, sign, pixel_noise(counts, valid), blur_sigma_px)
+    return _Scene(counts, image, valid, sign, pixel_noise(counts, valid), blur_sigma_px, unit)
 
 
 def _refined(raised: Relief, places: Places, search: float, centroid: float) -> Places:

@@ -27,16 +27,16 @@ from scipy.spatial import cKDTree
 from . import schema
 from .errors import InputError, SettingsError
 from .journal import Payload
+from .kernels.magnitude import unit_of
 from .kernels.peaks import centroids, local_maxima
 from .lattice import Relief, binned, find_lattice, pixel_noise, relief
 from .movie import Movie
-from .passes import Passes, save_array
+from .passes import Passes, load_saved, save_array
 from .progress import Sink, silent
 from .provenance import stage_key
 from .seeds import column_dataset, positions
 from .settings import ColumnSettings
 from .shards import Shard
-from .stores import load_array
 from .windows import default_window
 
 Floats = NDArray[np.floating[Any]]
@@ -265,7 +265,9 @@ def detect_columns(
 
 
 def _filled(image: Floats, valid: Mask) -> Floats:
-    """Return the image with the median of its valid pixels where it is not valid."""
+    """Return the image in units of :func:`unit_of`, with the median of its valid pixels where it is not valid."""
+    unit = unit_of(image)
+    image = image if unit == 1 else image / unit
     return image if valid.all() else np.where(valid, image, np.median(image[valid]))
 
 
@@ -304,10 +306,11 @@ def _in_movie(
 ) -> Places:
     template = b"" if detector.template is None else detector.template.tobytes()
     with Passes("detect", movie, on_event, folder, client, runs=1) as stage:
-        done = stage.journal("detections", stage_key(movie.key, repr(detector), template, repr(movie.shape)))
+        key = stage_key("columns", movie.key, repr(detector), template, movie.shape)
+        done = stage.journal("detections", key, {"found": ()})
         stage.begin([(done, movie.shards)])
         stage.run(partial(_detect_shard, movie, detector, done.path), movie.shards, done)
-        found = np.concatenate([load_array(done.path / f"{shard.index}.npy") for shard in movie.shards])
+        found = np.concatenate([load_saved(done.path / f"{shard.index}.npy") for shard in movie.shards])
         found[:, 1:3] -= shift[found[:, 0].astype(np.int64)]
         stage.end(f"{len(found) / movie.n_frames:.1f} a frame")
     return found

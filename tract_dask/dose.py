@@ -18,7 +18,7 @@ from .fit import fit_columns
 from .kernels.filters import Tiles
 from .kernels.sums import add_tiles
 from .movie import Frames, Movie
-from .provenance import stage_key
+from .provenance import digest_of
 from .schema import AMPLITUDE, BACKGROUND
 from .settings import FitSettings
 from .shard_files import overlaps
@@ -71,7 +71,7 @@ def rebin_frames(movie: Movie, n: int, drift: xr.Dataset | None = None) -> Summe
         path=movie.path,
         shape=(n_sums, *movie.shape[1:]),
         dtype=_dtype_of_sum(movie.dtype, n),
-        key=stage_key(movie.key, f"sums of {n}", shift.tobytes()),
+        key=digest_of(movie.key, f"sums of {n}", shift),
         frames_per_shard=min(n_sums, max(1, movie.frames_per_shard // n)),
         bins=(),
         pixel_size_pm=movie.pixel_size_pm,

@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from . import schema
 from .errors import SettingsError, SourceError
-from .journal import Payload
+from .journal import Fields, Payload
 from .kernels.alignment import Template, align
+from .kernels.magnitude import unit_of
 from .kernels.registration import (
     Floats,
     Image,
@@ -41,8 +42,10 @@ from .kernels.registration import (
     search,
 )
 from .kernels.sums import Whole, add_shifted
+from .keyed import counted
 from .movie import Movie
-from .passes import Passes, save_array
+from .passes import Passes, load_saved, save_array
+from .processor import processor
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import stage_key
 from .settings import DriftSettings
@@ -66,7 +69,11 @@ SEARCH_SHARE = 0.4
 SEARCH_LOSS = 0.75
 """For the search it is binned by 2 and 2 again as long as that loses less than this share of the information."""
 
-PASSES = ("follow", "refine")
+PASSES: dict[str, Fields] = {
+    "follow": {"drift": (None, 2), "placed": (None, 2), "trusted": (None,)},
+    "refine": {"drift": (None, 2), "quality": (None,)},
+}
+"""The two runs over the movie, and what a shard's payload holds after each."""
 
 _BLOCK_BYTES = 16 << 20
 _SAMPLES, _SAMPLE_FRAMES = 4, 2
@@ -101,8 +108,8 @@ def estimate_drift(
     Returns
     -------
     xr.Dataset
-        :data:`schema.DRIFT`, with attributes ``method``, ``pixel_size_pm``, and for method auto ``bin``,
-        ``search_px`` and ``period_px`` (None: no lattice found), in px of the movie.
+        :data:`schema.DRIFT`, with attributes ``method``, ``pixel_size_pm``, and for method auto ``processors`` (kinds
+        that took part), ``bin``, ``search_px`` and ``period_px`` (None: no lattice found), in px of the movie.
 
     Raises
     ------
@@ -208,6 +215,8 @@ class Level:
         Search range, px of the level.
     search_fold
         Further binning for the search.
+    unit
+        By which pixels are divided (:func:`unit_of`).
     """
 
     stored: int
@@ -216,6 +225,7 @@ class Level:
     spectrum: Spectrum
     search: float
     search_fold: int
+    unit: float
 
     @property
     def bin(self) -> int:
@@ -258,8 +268,8 @@ def _measure_drift(
     level = _choose_level(movie, settings)
     shards = _parts(movie)
     with Passes("drift", movie, on_event, folder, client, len(PASSES)) as stage:
-        key = stage_key(movie.key, f"drift {settings.search_px!r}")
-        follow, refine = (stage.journal(name, f"{name} {key}") for name in PASSES)
+        key = stage_key("drift", movie.key, counted("drift", drift=settings))
+        follow, refine = (stage.journal(name, f"{name} {key}", fields) for name, fields in PASSES.items())
         stage.begin([(follow, shards), (refine, shards)])
         payloads = stage.run(partial(_follow_shard, movie, level, follow.path), shards, follow)
         track, places = _chain(level, shards, payloads, follow.path)
@@ -280,6 +290,7 @@ def _measure_drift(
         movie,
         method="auto",
         bin=level.bin,
+        processors=sorted({payload["processor"] for payload in payloads.values()}),
         search_px=level.search * level.bin,
         period_px=level.spectrum.period_px * level.bin if np.isfinite(level.spectrum.period_px) else None,
     )
@@ -301,6 +312,8 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     bins = sorted({1, *movie.bins})
     stored = next((b for b in bins if (ny // b) * (nx // b) <= LEVEL_PIXELS), bins[-1])
     samples = _samples(movie, stored)
+    unit = unit_of(samples[0])
+    samples = [_in_units(image, unit) for image in samples]
     spectrum, fold = measure_spectrum(samples), 1
     while spectrum.loss(2) < FOLD_LOSS and min(ny, nx) // (stored * fold) >= 2 * SMALLEST_SIDE:
         fold *= 2
@@ -312,7 +325,7 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     search_fold = 1
     while spectrum.loss(2 * search_fold) < SEARCH_LOSS and min(shape) // search_fold >= 2 * SMALLEST_SIDE:
         search_fold *= 2
-    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold)
+    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold, unit)
 
 
 def _samples(movie: Movie, stored: int) -> list[Image]:
@@ -327,7 +340,14 @@ def _samples(movie: Movie, stored: int) -> list[Image]:
 def _frames(movie: Movie, level: Level, shard: Shard) -> Iterator[Image | None]:
     """Yield the frames of a shard on a level, less the movie's mean; None for one that holds nothing."""
     for image in _read(movie, level.stored, shard):
-        yield None if image is None else fold_image(image, level.fold) - np.float32(level.spectrum.mean)
+        if image is None:
+            yield None
+        else:
+            yield fold_image(_in_units(image, level.unit), level.fold) - np.float32(level.spectrum.mean)
+
+
+def _in_units(image: Image, unit: float) -> Image:
+    return image if unit == 1 else (image / unit).astype(np.float32)
 
 
 def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
@@ -437,7 +457,7 @@ def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], 
             continue
         here = slice(shard.start, shard.stop)
         first, final = np.flatnonzero(trusted)[[0, -1]]
-        total, exposure = load_array(folder / f"{shard.index}.npy")
+        total, exposure = load_saved(folder / f"{shard.index}.npy")
         guess = last - drift[first] if track.trusted.any() else np.zeros(2)
         small = fold_image(total / np.float32(max(1.0, exposure.max())), level.search_fold)
         offset, _ = follower.follow(small, guess)
@@ -455,7 +475,7 @@ def _add_up(level: Level, places: Whole, folder: Path) -> Image:
     """Return the sum of all shards and how many frames cover each of its pixels, (2, y, x)."""
     total = np.zeros((2, *level.shape), np.float32)
     for index, place in enumerate(places):
-        add_shifted(total, load_array(folder / f"{index}.npy"), place)
+        add_shifted(total, load_saved(folder / f"{index}.npy"), place)
     return total
 
 
@@ -471,14 +491,14 @@ def _refine_shard(movie: Movie, level: Level, follow: Path, folder: Path, shard:
         if image is not None:
             fit = align(image, template, tuple(track.drift[k]), limit=level.search / 2)
             drift[k], quality[k] = (fit.dy, fit.dx), max(0.0, fit.correlation)
-    return {"drift": drift, "quality": quality}
+    return {"drift": drift, "quality": quality, "processor": processor()}
 
 
 def _mean_of_others(level: Level, follow: Path, folder: Path, shard: Shard) -> Template:
     """Return the mean of all shards but one; of all, where there is no other."""
-    every, place = load_array(folder / "sum.npy"), load_array(folder / "places.npy")[shard.index]
+    every, place = load_saved(folder / "sum.npy"), load_saved(folder / "places.npy")[shard.index]
     others = every.copy()
-    add_shifted(others, -load_array(follow / f"{shard.index}.npy"), place)
+    add_shifted(others, -load_saved(follow / f"{shard.index}.npy"), place)
     total, exposure = others if others[1].any() else every
     return Template(total, exposure, level.spectrum.frequency, level.spectrum.gain(max(1.0, float(exposure.max()))))
 

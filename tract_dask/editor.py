@@ -36,7 +36,7 @@ from .service.api import previews
 from .service.config import ServiceConfig
 from .service.entrance import access
 from .service.entrance.headers import CONTENT_SECURITY_POLICY, SecurityHeaders
-from .service.folders import DataRoot
+from .service.folders import STATE_FOLDER, DataRoot
 from .service.jobs.states import State
 from .service.jobs.store import JobStore
 from .service.pages import static_files, templates
@@ -166,7 +166,7 @@ class ColumnEditor:
         self._folder = tempfile.TemporaryDirectory(prefix="tract-dask-columns-")
         self._viewers, self._done = _Viewers(), threading.Event()
         root = Path(self._folder.name)
-        self._store = _TellingStore(ServiceConfig(root).database, self._keep)
+        self._store = _TellingStore(ServiceConfig(root, state_dir=root / STATE_FOLDER).database, self._keep)
         self._job = _prepare(root, self._store, summed, columns, settings)
         secret = secrets.token_urlsafe(24)
         app = _application(root, self._store, self._job, self._viewers, self._go_on)

@@ -56,6 +56,14 @@ class SourceError(InputError):
     """A movie file is missing, damaged, or not a movie."""
 
 
+class MissingSourceError(SourceError):
+    """A movie file is not there, or one that it leads to."""
+
+
+class ChangedSourceError(SourceError):
+    """A movie's files changed while they were read."""
+
+
 class SettingsError(InputError):
     """A setting is out of range, unknown, or contradicts another."""
 

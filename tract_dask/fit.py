@@ -14,12 +14,16 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import results, schema, stores
-from .errors import SettingsError
-from .journal import Journal, Payload, journal_beside
+from .errors import SettingsError, StoreError
+from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.gaussian import blurred
+from .keyed import counted
 from .measure import Floats, Job, measure
 from .movie import Movie
-from .progress import ShardDone, Sink, StageDone, StageStarted, silent
+from .parts import DamagedPartError, join, write
+from .pixel_range import check_pixels
+from .processor import processor, widths
+from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import REJECTED, Status, X, Y
 from .settings import FitSettings, from_toml
@@ -27,6 +31,10 @@ from .shards import Shard
 from .tasks import stream_shards
 from .vacuum import check_box, find_vacuum
 from .windows import check_window, default_window, neighbour_distance
+
+_COUNTS = ("fits", "accepted", "bad_frames")
+_ATTEMPTS = 3
+"""So often shards are fitted whose fits turn out to be damaged on disk."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,8 @@ def fit_columns(
     ------
     SettingsError
         Where a window is larger than the frame, the vacuum box leaves it, or counts (``poisson``) are negative.
+    InputError
+        Where float32 does not hold the pixels (:func:`tract_dask.pixel_range.check_pixels`).
     """
     import dask.array as da  # takes its time, and workers do not need it
 
@@ -133,12 +143,12 @@ def fit_movie(
     key = fit_key(movie, columns, job)
     about = stores.attributes(path)
     if about.get("key") == key and about.get("complete"):
-        stores.remove(journal_beside(path))  # of a run that was killed just before it had removed it
+        remove_journal(journal_beside(path))  # of a run that was killed just before it had removed it
         results.calibrate(path, frame_times(movie), **_calibration(movie))
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
     if about.get("key") != key:
-        stores.remove(journal_beside(path))
+        remove_journal(journal_beside(path))
         results.create(
             path,
             columns,
@@ -152,30 +162,52 @@ def fit_movie(
             reference_blur_px=columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px),
             refine_columns=job.refine_columns,
         )
-    journal = Journal(journal_beside(path), key)
+    journal = Journal(journal_beside(path), key, dict.fromkeys(_COUNTS, ()))
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
-    summary = dict.fromkeys(("fits", "accepted", "bad_frames"), 0)
+    for attempt in range(_ATTEMPTS):
+        summary, processors = _fit_shards(movie, path, journal, client, on_event)
+        try:
+            join(path, journal, client, on_event, attempt)
+            break
+        except DamagedPartError as error:
+            if attempt == _ATTEMPTS - 1:
+                raise
+            on_event(Warned(f"{error.what}: they are made anew"))
+    results.finish(path, summary=summary, processors=sorted(processors))
+    journal.remove()
+    if len(mixed := widths(processors)) > 1:
+        lanes = " and ".join(map(str, mixed))
+        on_event(Warned(f"processors with vectors of {lanes} numbers took part: last digits depend on which did what"))
+    on_event(
+        StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
+    )
+    return FitSummary(**summary)
+
+
+def _fit_shards(
+    movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink
+) -> tuple[dict[str, int], set[str]]:
+    """Fit the shards that are not on disk; return the counts of all, and the processors that took part."""
+    summary, processors = dict.fromkeys(_COUNTS, 0), set[str]()
 
     def add(shard: Shard, payload: Payload) -> None:
         for name in summary:
             summary[name] += payload[name]
+        processors.add(payload["processor"])
 
     stream_shards(
-        partial(_fit_task, movie, path, key),
+        partial(_fit_task, movie, path, journal.key, journal.path),
         movie.shards,
         add,
         journal=journal,
         name="fit",
         client=client,
         on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
+        file=str(movie.path),
+        on_event=on_event,
     )
-    stores.update_attributes(path, complete=True, summary=summary)
-    journal.remove()
-    on_event(
-        StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
-    )
-    return FitSummary(**summary)
+    return summary, processors
 
 
 def prepare(
@@ -198,6 +230,7 @@ def prepare(
     elif summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
+    check_pixels(statistics, str(movie.path))
     bad = statistics["frame_bad_pixels"].to_numpy() > 0
     if settings.estimator == "poisson":
         _check_counts(statistics["frame_min"].to_numpy())
@@ -227,10 +260,11 @@ def _check_counts(smallest: Floats) -> None:
 
 def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
     """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
-    numbers = np.concatenate([job.reference.ravel(), job.drift.ravel(), columns["column_id"].to_numpy().astype(float)])
-    kinds = "\0".join(map(str, columns["kind"].to_numpy()))
-    rest = f"{movie.gain!r} {job.window} {job.vacuum} {job.refine_columns} {kinds}"
-    return stage_key(movie.key, numbers.tobytes(), rest, job.settings)
+    arrays = (job.reference, job.drift, columns["column_id"].to_numpy().astype(np.int64))
+    vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
+    numbers = [movie.gain, int(job.window), vacuum, job.refine_columns]
+    kinds = [str(kind) for kind in columns["kind"].to_numpy()]
+    return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
 
 
 def _spacing(columns: xr.Dataset) -> float:
@@ -253,15 +287,16 @@ def frame_times(movie: Movie) -> Floats:
     return np.arange(movie.n_frames, dtype=np.float64) * (movie.frame_time_s or 1.0)
 
 
-def _fit_task(movie: Movie, path: Path, key: str, shard: Shard) -> Payload:
+def _fit_task(movie: Movie, path: Path, key: str, run: Path, shard: Shard) -> Payload:
     job = _load(movie, path, key)
     values = measure(movie, shard, job)
-    results.write(path, shard, values, movie.shards[0].frames)
+    write(run, shard, values, movie.shards[0].frames)
     fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
     return {
         "fits": int(fitted.sum()),
         "accepted": int(((values["status"] & REJECTED) == 0).sum()),
         "bad_frames": int(job.bad[shard.start : shard.stop].sum()),
+        "processor": processor(),
     }
 
 
@@ -270,6 +305,10 @@ def _load(movie: Movie, path: Path, key: str) -> Job:
     """Return what the tasks of one fit stage share, from the stores; ``key`` tells one stage from the next."""
     store = stores.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
     about = stores.attributes(path)
+    if about.get("key") != key:
+        raise StoreError(
+            "a task is left over from an earlier run", str(path), f"key {key}", f"key {about.get('key')}", "Go on"
+        )
     bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
     vacuum = tuple(about["vacuum"]) if about["vacuum"] else None
     settings = from_toml(FitSettings, about["settings"], str(path))

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 
-AVAILABLE = sys.platform == "linux"
-"""Elsewhere workers are spawned: Windows cannot fork, and on macOS system libraries do not survive it."""
+AVAILABLE = sys.platform == "linux" and sys.version_info >= (3, 11, 1)
+"""Elsewhere workers are spawned: Windows cannot fork, and on macOS system libraries do not survive it.
+
+The server of Python 3.11.0 listens where every user of the machine can send it code (CVE-2022-42919).
+"""
 
 THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
@@ -43,11 +47,26 @@ _PRELOAD = [f"{__package__}.preload"]
 
 
 def start() -> None:
-    """Start the server, if it can be used here and does not run yet; it ends with this process."""
+    """Start the server, if it can be used here and does not run yet; it ends with this process.
+
+    Neither it nor what is forked from it hears Ctrl-C, which the terminal sends to all: this process ends them in
+    good order.
+    """
     if AVAILABLE:
         multiprocessing.set_forkserver_preload(_PRELOAD)
-        with _environment():
+        resource_tracker.ensure_running()  # which the server would start, and which hears nothing by itself
+        with _environment(), _deaf():
             forkserver.ensure_running()
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let what is started in this block never see SIGINT; one that comes meanwhile reaches this process afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -22,9 +22,18 @@ data_root_option = click.option(
     help="Folder with the movies; results go there too.",
 )
 
+state_dir_option = click.option(
+    "--state-dir",
+    type=PATH,
+    envvar="TRACT_DASK_STATE_DIR",
+    show_envvar=True,
+    help="Folder of the service's own store, with the tokens; else one of the data root's own in ~/.local/state.",
+)
+
 
 @click.command()
 @data_root_option
+@state_dir_option
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on; any other demands tokens.")
 @click.option(
     "--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
@@ -39,8 +48,8 @@ data_root_option = click.option(
 def serve(settings: RunSettings, **options: Any) -> None:
     """Serve jobs, their results and pages to watch them.
 
-    It keeps its own store in the folder .tract_dask of the data root. Stop it, or lose the machine: started again, it
-    goes on with every job.
+    Jobs and tokens are kept in the state folder, which lies outside of the data root. Stop it, or lose the machine:
+    started again, it goes on with every job.
     """
     with uncollected():
         from .service import serving
@@ -62,26 +71,32 @@ def token() -> None:
 @click.option("--role", default="user", type=click.Choice(("admin", "user", "monitor")), help="What it may do. [user].")
 @click.option("--file", type=PATH, help="Write it there, readable by you only, and do not print it.")
 @data_root_option
+@state_dir_option
 @common_options
-def token_create(name: str, data_root: Path, *, role: str, file: Path | None, as_json: bool) -> None:
+def token_create(
+    name: str, data_root: Path, state_dir: Path | None, *, role: str, file: Path | None, as_json: bool
+) -> None:
     """Create a token for NAME, and show it this once.
 
     A user submits jobs and changes their own; an admin changes all; a monitor reads health and metrics only.
     """
+    from .service.config import ServiceConfig
     from .service.serving import create_token
 
-    made = create_token(data_root, name, role, file)
+    made = create_token(ServiceConfig(data_root, state_dir=state_dir), name, role, file)
     show({"name": name, "role": role} | ({"wrote": str(file)} if file else {"token": made}), as_json=as_json)
 
 
 @token.command(name="list")
 @data_root_option
+@state_dir_option
 @common_options
-def token_list(data_root: Path, *, as_json: bool) -> None:
+def token_list(data_root: Path, state_dir: Path | None, *, as_json: bool) -> None:
     """List the tokens, the revoked ones too; their secrets are known to nobody but their holders."""
+    from .service.config import ServiceConfig
     from .service.serving import list_tokens
 
-    found = list_tokens(data_root)
+    found = list_tokens(ServiceConfig(data_root, state_dir=state_dir))
     if as_json:
         click.echo(json.dumps([vars(item) for item in found]))
         return
@@ -94,12 +109,14 @@ def token_list(data_root: Path, *, as_json: bool) -> None:
 @token.command(name="revoke")
 @click.argument("name")
 @data_root_option
+@state_dir_option
 @common_options
-def token_revoke(name: str, data_root: Path, *, as_json: bool) -> None:
+def token_revoke(name: str, data_root: Path, state_dir: Path | None, *, as_json: bool) -> None:
     """Revoke the token with the name or ID NAME; its sessions in browsers end at once."""
+    from .service.config import ServiceConfig
     from .service.serving import revoke_token
 
-    revoked = revoke_token(data_root, name)
+    revoked = revoke_token(ServiceConfig(data_root, state_dir=state_dir), name)
     show({"revoked": revoked.name, "id": revoked.id}, as_json=as_json)
 
 

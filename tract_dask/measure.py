@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from .filtering import filter_frame
 from .kernels.centroids import BEST_RADIUS, SMALLEST_RADIUS_PX, window_centroids
 from .kernels.filters import Tiles, cut_windows, gaussian_kernel
 from .kernels.fitting import GaussianFits, fit_gaussians
+from .kernels.magnitude import unit_of
 from .kernels.presence import Filters, matched_filters, strengths
 from .movie import Movie
 from .schema import AMPLITUDE, BACKGROUND, REJECTED, SIGMA_A, SIGMA_B, SIZES, THETA, Status, X, Y
@@ -68,6 +69,20 @@ class Job:
         """The matched filter of each column, by which it is told whether it is there."""
         return matched_filters(self.reference, self.window, self.settings.window_blur_px)
 
+    @cached_property
+    def unit(self) -> float:
+        """Counts in the unit that frames are computed in."""
+        return unit_of(self.reference[:, [AMPLITUDE, BACKGROUND]])
+
+    @cached_property
+    def in_units(self) -> Job:
+        """The same with the reference's counts in that unit."""
+        if self.unit == 1:
+            return self
+        reference = self.reference.copy()
+        reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
+        return replace(self, reference=reference)
+
 
 def measure(movie: Movie, shard: Shard, job: Job) -> Values:
     """Return the values of every fitted variable of :data:`schema.RESULTS` for the frames of one shard.
@@ -97,17 +112,18 @@ def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.nda
 
     They begin with the first of a layer of tiles, or are a single one, ``frame``, which has been read.
     """
-    drift = job.drift[start:stop]
+    job, unit = job.in_units, job.unit
+    drift, gain = job.drift[start:stop], movie.gain / unit
     place = job.reference[None, :, [Y, X]] + drift[:, None]
     corner = np.rint(place).astype(np.int64) - job.window // 2
     outside = np.any((corner < 0) | (corner + job.window > np.array(movie.shape[1:])), axis=-1)
     vacuum = _vacuum(job, drift, movie.shape[1:])
     bad = np.broadcast_to(job.bad[start:stop, None], outside.shape)
     if frame is None:
-        tiles, gain = _read(movie, start, stop, job, corner[~outside], vacuum), movie.gain
+        tiles = _read(movie, start, stop, job, corner[~outside], vacuum)
     else:
         whole = job.settings.filters_frames
-        pixels, gain = (filter_frame(frame, job.settings, movie.gain), 1.0) if whole else (frame, movie.gain)
+        pixels, gain = (filter_frame(frame, job.settings, gain), 1.0) if whole else (frame, gain)
         tiles = Tiles(pixels[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
     fits, centroid, presence, residual, held = _fit(tiles, corner, drift[:, None] - corner, job, gain)
     fits.estimates[..., [Y, X]] += corner
@@ -119,6 +135,8 @@ def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.nda
     status = _status(fits, held, outside, bad, job.settings.threshold * noise)
     refined: Floats = drift + _common_motion(fits, status, drift, job)
     fits.estimates[..., [Y, X]] -= refined[:, None]
+    for counts in (fits.estimates, fits.stderr):
+        counts[..., [AMPLITUDE, BACKGROUND]] *= unit
     intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale)
     return {
         "fit": fits.estimates,
@@ -126,14 +144,14 @@ def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.nda
         "centroid": centroid - refined[:, None],
         "intensity": intensity,
         "intensity_error": intensity_error,
-        "intensity_stderr": INTENSITY_SCALE[job.settings.intensity_scale] * fits.volume_stderr,
+        "intensity_stderr": INTENSITY_SCALE[job.settings.intensity_scale] * unit * fits.volume_stderr,
         "status": status,
         "presence": presence * precision,
         "presence_vacuum": empty * precision,
         "r_squared": fits.r_squared,
         "n_iterations": fits.n_iterations * ~outside,
         "drift": refined,
-        "noise": noise,
+        "noise": unit * noise,
     }
 
 

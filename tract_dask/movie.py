@@ -16,11 +16,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from . import schema, stores
+from .damage import reading
 from .errors import MissingStoreError, StoreError
 from .journal import entries, journal_beside
 from .kernels.filters import Tiles
 from .ome import AXES
-from .shard_files import Grid, ShardReader, overlaps, shard_path
+from .shard_files import Grid, ShardReader, chunk_path, overlaps
 from .shards import Shard, Shards, split
 
 Frames: TypeAlias = NDArray[Any]
@@ -44,6 +45,15 @@ def open_movie(path: str | Path) -> Movie:
             "a store made by tract_dask's convert",
             "something else" if path.exists() else "nothing",
             "Convert the movie first",
+        )
+    needed = ("shape", "complete", "frames_per_shard", "dtype", "key", "bins", *schema.CALIBRATION)
+    if lacking := [name for name in needed if name not in present]:
+        raise MissingStoreError(
+            "this movie store is of another version",
+            str(path),
+            "all that this version knows of a movie",
+            f"no {', '.join(lacking)}",
+            "Convert the movie again",
         )
     shape = tuple(present["shape"])
     if not present["complete"]:
@@ -186,9 +196,7 @@ class Movie:
 
     def statistics(self) -> xr.Dataset:
         """Return the per-frame statistics (``schema.STATISTICS``) on ``t``, in memory."""
-        store = xr.open_zarr(self.path, consolidated=False, chunks=None)
-        statistics: xr.Dataset = store[list(schema.STATISTICS)].load()
-        return statistics
+        return stores.open_dataset(self.path, only=tuple(schema.STATISTICS))
 
     @property
     def frames(self) -> xr.DataArray:
@@ -203,7 +211,7 @@ class Movie:
             inline_array=True,
             fancy=False,
         )
-        store = xr.open_zarr(self.path, consolidated=False, chunks=None)
+        store = stores.open_dataset(self.path, only=AXES)
         known = {name: getattr(self, name) for name in schema.CALIBRATION}
         attributes = {name: value for name, value in known.items() if value is not None}
         return xr.DataArray(pixels, {axis: store[axis] for axis in AXES}, AXES, "movie", attributes)
@@ -222,18 +230,12 @@ class Movie:
     def _shard(self, name: str, number: int) -> Iterator[ShardReader]:
         """Open a shard of the frames or of a binned level; what is wrong with it becomes a StoreError."""
         level = _open_level(self.path, self.key, name)
-        path = shard_path(self.path / name, number)
-        try:
-            with ShardReader(path, level.grid, level.dtype, encoded=level.encoded) as reader:
-                yield reader
-        except (OSError, ValueError) as error:
-            shard = self.shards[number]
-            raise StoreError(
-                f"frames {shard.start} to {shard.stop - 1} cannot be read",
-                str(path),
-                got=str(error),
-                remedy="The shard is damaged: remove the store and convert the movie again",
-            ) from error
+        path = chunk_path(self.path / name, number, 0, 0, separator=level.separator)
+        with (
+            reading(path),
+            ShardReader(path, level.grid, level.dtype, encoded=level.encoded, checked=level.checked) as reader,
+        ):
+            yield reader
 
 
 @dataclass(frozen=True)
@@ -279,13 +281,18 @@ class _Level:
     grid: Grid
     dtype: np.dtype[Any]
     encoded: bool
+    checked: bool
+    separator: str
 
 
 @lru_cache(maxsize=32)
 def _open_level(path: Path, key: str, name: str) -> _Level:
     """Read how a level lies on disk, once in a process; the key tells a store from another later at the same place."""
     array: Any = stores.open_array(path / name)
-    return _Level(Grid(array.shape, array.chunks, array.shards), array.dtype, bool(array.compressors))
+    named = [codec.to_dict()["name"] for codec in array.compressors]
+    grid = Grid(array.shape, array.chunks, array.shards)
+    separator = array.metadata.chunk_key_encoding.separator
+    return _Level(grid, array.dtype, "blosc" in named, "crc32c" in named, separator)
 
 
 def _touched(boxes: NDArray[np.int64], shape: tuple[int, ...], tile: tuple[int, int]) -> NDArray[np.int64]:

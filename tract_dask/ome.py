@@ -22,17 +22,15 @@ def describe(path: Path, ours: dict[str, Any]) -> None:
         ("y", ours["shape"][1], pixel, ("pm", "px")),
         ("x", ours["shape"][2], pixel, ("pm", "px")),
     ):
-        coordinate = zarr.open_array(str(path / axis), mode="r+")
-        coordinate[...] = np.arange(length) * (step or 1.0)
-        coordinate.attrs["units"] = units[0] if step else units[1]
-    file = path / "zarr.json"
-    root = json.loads(file.read_text(encoding="utf-8"))
+        stores.overwrite_array(path / axis, np.arange(length) * (step or 1.0))
+        zarr.open_array(str(path / axis), mode="r+").attrs["units"] = units[0] if step else units[1]
+    root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     root["attributes"] = {
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),
         stores.ATTRIBUTE: ours,
     }
     root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": _nodes(path)}
-    stores.write_aside(file, json.dumps(root, indent=2).encode())
+    stores.write_root(path, root, changed=AXES)
 
 
 def _nodes(path: Path) -> dict[str, Any]:

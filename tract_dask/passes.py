@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import io
 import tempfile
+import uuid
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,11 +15,14 @@ import numpy as np
 from distributed import Client
 from numpy.typing import NDArray
 
-from .journal import Journal, Payload
+from . import disk
+from .errors import StoreError
+from .journal import Fields, Journal, Payload
 from .movie import Movie
 from .progress import ShardDone, Sink, StageDone, StageStarted
+from .shard_files import checksum, unchecked
 from .shards import Shard
-from .stores import disk_errors
+from .stores import disk_errors, sole_parser
 from .tasks import run_shards
 
 
@@ -39,10 +43,10 @@ class Passes:
     def __exit__(self, *error: object) -> None:
         self._stack.close()
 
-    def journal(self, name: str, key: str) -> Journal:
-        """Return the journal of one of the stage's runs."""
+    def journal(self, name: str, key: str, fields: Fields) -> Journal:
+        """Return the journal of one of the stage's runs, whose payloads hold ``fields``."""
         assert self._folder is not None
-        return Journal(self._folder / name, key)
+        return Journal(self._folder / name, key, fields)
 
     def begin(self, runs: list[tuple[Journal, Sequence[Shard]]]) -> None:
         """Tell that the stage begins, and how much of it is done."""
@@ -58,7 +62,16 @@ class Passes:
             self._computed = True
             self.on_event(ShardDone(self.name, shard.index, shard.frames))
 
-        return run_shards(task, shards, journal=journal, name=self.name, client=self.client, on_done=tell)
+        return run_shards(
+            task,
+            shards,
+            journal=journal,
+            name=self.name,
+            client=self.client,
+            on_done=tell,
+            file=str(self.movie.path),
+            on_event=self.on_event,
+        )
 
     def end(self, summary: str) -> None:
         """Tell that the stage is done."""
@@ -66,8 +79,38 @@ class Passes:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as .npy, beside its place first, then renamed."""
-    aside = path.with_name(f".{path.stem}.{os.getpid()}.partial.npy")
+    """Write an array as .npy, and behind it a checksum of all: beside its place first, then synced and renamed."""
+    data = io.BytesIO()
+    np.save(data, array)
+    aside = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.partial")
     with disk_errors(path):
-        np.save(aside, array)
-        aside.replace(path)
+        try:
+            with aside.open("wb") as file:
+                file.writelines((data.getbuffer(), checksum(data.getbuffer())))
+            disk.place(aside, path)
+        except BaseException:
+            aside.unlink(missing_ok=True)
+            raise
+
+
+def load_saved(path: Path) -> NDArray[Any]:
+    """Return what :func:`save_array` wrote.
+
+    Raises
+    ------
+    StoreError
+        Where it is missing, or damaged.
+    """
+    try:
+        data = unchecked(memoryview(path.read_bytes()))
+    except (FileNotFoundError, ValueError) as error:
+        raise StoreError(
+            "what a task of this stage left is missing, or damaged",
+            str(path),
+            "an array with its checksum",
+            str(error),
+            "Delete this file and run again: it is made anew",
+        ) from error
+    with sole_parser():
+        array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    return array

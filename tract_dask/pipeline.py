@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -18,11 +19,12 @@ from distributed import Client
 
 from . import stores
 from .cluster import LazyClient, local_memory_limit, memory_budget
+from .conversion import check_kept, is_movie_of, remembered_source
 from .drift import read_drift_csv
-from .errors import ClusterError, DestinationError, InputError
+from .errors import ClusterError, DestinationError, InputError, SourceError, StoreError
 from .fit import FitSummary
-from .io import FrameSource, open_source
-from .journal import journal_beside
+from .io import FileList, FrameSource, Permit, open_source
+from .journal import journal_beside, remove_journal
 from .layout import peak_memory, plan_layout
 from .movie import Movie, open_movie
 from .progress import (
@@ -42,7 +44,8 @@ from .progress import (
 from .seeds import read_columns_csv
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import split
-from .stages import columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
+from .stages import clear_columns, columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
+from .tls import open_to_others
 from .windows import check_window
 
 WORKER_BYTES = 300_000_000
@@ -100,6 +103,11 @@ class Outputs:
     def events(self) -> Path:
         """What happened when."""
         return self.root / "events.jsonl"
+
+    def written(self) -> tuple[Path, ...]:
+        """Return everything that a run writes: its stores, beside which journals may lie, then its files."""
+        stages = (self.movie, self.drift, self.sum, self.columns.with_suffix(".zarr"), self.results)
+        return (*stages, self.columns, self.columns.with_suffix(".png"), self.report, self.settings, self.events)
 
     def paths(self) -> dict[str, str]:
         """Return the paths by name."""
@@ -201,7 +209,7 @@ def plan_run(
 
 
 def run(
-    source: str | Path,
+    source: str | Path | FileList,
     output: str | Path,
     settings: RunSettings | None = None,
     *,
@@ -212,11 +220,15 @@ def run(
     report: bool = True,
     until: str | None = None,
     patience_s: float = 0.0,
+    permit: Permit | None = None,
 ) -> RunOutcome:
     """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
 
-    What an earlier run with the same settings has done is kept; changed settings redo what they affect. A table of
-    columns that was edited by hand is kept, and fitted.
+    What an earlier run with the same settings has done is kept; changed settings redo what they affect, but a finished
+    conversion is thrown away with ``overwrite`` only. A table of columns that was edited by hand is kept, and fitted,
+    until the method or the file of columns changes.
+
+    Once the movie is converted, its source may be moved or archived.
 
     Parameters
     ----------
@@ -229,7 +241,8 @@ def run(
     on_event
         Takes the run's progress. What it raises ends the run, which goes on from there as after any other error.
     overwrite
-        Begin anew, even where the folder holds something else.
+        Begin anew, even where the folder holds something else, or a movie that was converted otherwise. A table of
+        columns that was edited by hand stays, with the same movie, or is put away.
     plan_only
         Only plan, and write nothing.
     report
@@ -239,6 +252,8 @@ def run(
         ``columns``, the table can be edited first.
     patience_s
         How long to wait for another run in the same folder to end, in s.
+    permit
+        Called with the resolved path of every file of the source before it is opened.
 
     Raises
     ------
@@ -252,15 +267,15 @@ def run(
     settings = _absolute(settings or RunSettings())
     outputs = Outputs(Path(output).absolute())
     _check_stage(until)
-    with closing(_open(source, settings)) as opened:
+    with closing(_open(source, settings, None if overwrite else outputs.movie, permit)) as opened:
         check_inputs(opened, settings)
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
             return RunOutcome(outputs, plan, "planned", plan.frames)
-        check_output(outputs, opened, overwrite=overwrite)
+        check_output(outputs, opened, settings, overwrite=overwrite)
         with sole_run(outputs, patience_s):
             if overwrite:
-                clear_run(outputs)
+                clear_run(outputs, on_event, keep_edited=is_movie_of(outputs.movie, opened))
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -275,7 +290,7 @@ def run_convert(
 ) -> Movie:
     """Convert a movie to the store ``destination``; the first stage of :func:`run`, alone."""
     settings, path = _absolute(settings or RunSettings()), Path(destination).absolute()
-    with closing(_open(source, settings)) as opened:
+    with closing(_open(source, settings, None if overwrite else path)) as opened:
         plan = plan_run(opened.shape, opened.dtype, settings)
         with _Session(opened.path, path, settings.cluster, client, on_event, plan) as session:
             return convert_stage(opened, path, settings, session.workers, session.send, overwrite=overwrite)
@@ -397,12 +412,13 @@ def _stages(
 ) -> Iterator[str]:
     """Run the stages one by one; yield the name of each when it is done."""
     workers, send = session.workers, session.send
-    made.movie = movie = convert_stage(source, outputs.movie, settings, workers, send, overwrite=True)
+    made.movie = movie = convert_stage(source, outputs.movie, settings, workers, send)
     yield "convert"
     drift = drift_stage(movie, outputs.drift, settings.drift, workers, send)
     yield "drift"
     summed = sum_stage(movie, drift, outputs.sum, workers, send)
     yield "sum"
+    session.finish_aside()  # it imports what comes next: two threads could meet in packages that import each other
     columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
     made.columns = columns
     yield "columns"
@@ -443,6 +459,7 @@ class _Session:
         plan: Plan | None = None,
     ) -> None:
         self._started, self._plan, self._began = RunStarted(source, str(output)), plan, perf_counter()
+        self._is_given = client is not None
         self.workers, self.send = LazyClient(cluster, client, self._on_connect), send
         self.state, self.message = "done", ""
         self._thread, self._asides = ThreadPoolExecutor(1, "aside"), list[Future[object]]()
@@ -468,11 +485,20 @@ class _Session:
         if kind is not None:
             self.state, self.message = "interrupted" if kind is KeyboardInterrupt else "failed", ""
         self.send(RunDone(self.state, perf_counter() - self._began, self.message))
+        if isinstance(error, OSError) and error.errno and not isinstance(error, ConnectionError | TimeoutError):
+            raise StoreError(
+                "a file could not be read or written",
+                error.filename or f"{self._started.output}, made from {self._started.source}",
+                got=os.strerror(error.errno),
+                remedy="Look at the disk, then run the same command again: what is done is kept",
+            ) from error
 
     def _on_connect(self, client: Client) -> None:
         if self._plan:
             dataclasses.replace(self._plan, memory_limit=memory_budget(client)).check()
         self.send(dataclasses.replace(self._started, dashboard=client.dashboard_link or ""))
+        if not self._is_given and (warning := open_to_others(client.scheduler.address)):
+            self.send(Warned(warning))
         self.aside(_get_ready)
 
 
@@ -500,9 +526,21 @@ def _get_ready() -> None:
     load_kernels()
 
 
-def _open(source: str | Path, settings: RunSettings) -> FrameSource:
-    """Open the source by its whole path, which any worker can use."""
-    return open_source(str(Path(source).absolute()), settings.source, settings.metadata)
+def _open(
+    source: str | Path | FileList, settings: RunSettings, kept: Path | None, permit: Permit | None = None
+) -> FrameSource:
+    """Open the source by its whole path, which any worker can use.
+
+    A source that is not there is taken from the complete movie at ``kept``, if it is that movie's.
+    """
+    place = source if isinstance(source, FileList) else str(Path(source).absolute())
+    try:
+        return open_source(place, settings.source, permit=permit)
+    except SourceError as error:
+        gone = None if kept is None else remembered_source(kept, str(place), error)
+        if gone is None:
+            raise
+        return gone
 
 
 def sum_beside(path: Path) -> Path:
@@ -561,8 +599,18 @@ def _required(path: str | None, option: str) -> Path:
     return Path(path)
 
 
-def check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> None:
-    """Check that the folder is empty or holds a run of this movie, and can be written."""
+def check_output(
+    outputs: Outputs, source: FrameSource, settings: RunSettings | None = None, *, overwrite: bool
+) -> None:
+    """Check that the folder is empty or holds a run of this movie, and can be written.
+
+    Without ``settings``, those of its conversion are taken to be the same.
+
+    Raises
+    ------
+    DestinationError
+        Also where a complete movie would have to be thrown away.
+    """
     root = outputs.root
     ours = outputs.settings.exists() or outputs.events.exists()
     if root.exists() and not root.is_dir():
@@ -578,26 +626,36 @@ def check_output(outputs: Outputs, source: FrameSource, *, overwrite: bool) -> N
             ", ".join(others[:3]),
             "Choose another place, or say --overwrite",
         )
-    before = stores.attributes(outputs.movie).get("source", source.path)
-    if Path(before).absolute() != Path(source.path).absolute() and not overwrite:
-        raise DestinationError(
-            "this folder holds the run of another movie",
-            str(root),
-            source.path,
-            str(before),
-            "Choose another place, or say --overwrite",
-        )
+    if not overwrite:
+        _check_movie(outputs, source, settings)
     stores.check_destination(outputs.movie, overwrite=overwrite)
 
 
-def clear_run(outputs: Outputs) -> None:
-    """Delete what a run writes, and nothing else."""
-    stages = (outputs.movie, outputs.drift, outputs.sum, outputs.columns.with_suffix(".zarr"), outputs.results)
+def _check_movie(outputs: Outputs, source: FrameSource, settings: RunSettings | None) -> None:
+    """Check that the movie in a run's folder is one of this source, and would not have to be thrown away."""
+    present = stores.attributes(outputs.movie)
+    before = str(present.get("source", source.path))
+    unfinished_of_it = before == source.path and not present.get("complete")
+    if present.get("kind") == "movie" and not unfinished_of_it and not is_movie_of(outputs.movie, source):
+        raise DestinationError(
+            "this folder holds the run of another movie",
+            str(outputs.root),
+            f"an empty folder, or a run of what {source.path} holds now",
+            f"a run of what {before} held on {present.get('created', 'an unknown day')}",
+            "Choose another place, or say --overwrite: then all of that run is made again",
+        )
+    if settings is not None:
+        check_kept(outputs.movie, source, settings.convert, settings.source)
+
+
+def clear_run(outputs: Outputs, on_event: Sink = silent, *, keep_edited: bool = False) -> None:
+    """Delete what a run writes, and nothing else; columns that were edited by hand are kept, or put away."""
+    clear_columns(outputs.columns, on_event, keep_edited=keep_edited)
+    stages = (outputs.movie, outputs.drift, outputs.sum, outputs.results)
     for path in stages:
+        remove_journal(journal_beside(path))
         stores.remove(path)
-        stores.remove(journal_beside(path))
-    files = (outputs.columns, outputs.columns.with_suffix(".png"), outputs.report, outputs.settings, outputs.events)
-    for path in files:
+    for path in (outputs.report, outputs.settings, outputs.events):
         stores.remove(path)
 
 

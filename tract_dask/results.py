@@ -1,39 +1,40 @@
-"""results.zarr: create it, write it shard by shard, finish it, open it; and the mask of what can be trusted.
+"""results.zarr: create it, finish it, open it; and the mask of what can be trusted.
 
 The store is created whole before the first fit (columns, measured drift, times; everything else at its fill value), so
-that tasks need nothing but its path, and a viewer can open it while the fits still run.
+that tasks need nothing but its path, and a viewer can open it while the fits still run. What is fitted lies in the
+journal's folder until all is done (:mod:`tract_dask.parts`); then it is joined into a few files a variable.
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 import zarr
-from zarr.codecs import BloscCodec
 
-from . import schema, stores
+from . import disk, schema, stores
 from .errors import MissingStoreError, SettingsError
-from .journal import entries, journal_beside
+from .journal import Journal, journal_beside
+from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
 from .schema import REJECTED, Status
 from .settings import FitSettings, from_toml
-from .shard_files import BLOSC, encode
-from .shards import Shard
+from .shard_files import CHUNK_KEYS, chunk_path, codecs
 
 CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose")
 """What pixels and frames mean: attributes of the store, which any reader finds there."""
 
-_CODEC = "lz4"
 FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
 """The variables that :func:`accepted` masks."""
 
-_KNOWN_AT_START = ("drift_measured", "time")
-SHARDED = tuple(name for name in schema.RESULTS if name not in _KNOWN_AT_START)
-"""The variables of which every shard of the movie makes one chunk."""
+_FILE_SHARDS = (8, 64)
+"""Shards of the movie whose fits share a file a variable: no fewer, unless there are no more; no more."""
+
+_FILE_BYTES = 128 << 20
+"""So large may such a file be, before compression."""
 
 _CHUNK_BYTES = 32 << 20
 """Stored chunks are opened in groups, of so many bytes of ``fit``: small ones would be a task each."""
@@ -56,82 +57,139 @@ def create(
     drift, time
         Measured drift (frame, axis) in px and start of each frame (frame) in s.
     frames_per_shard
-        Frames in a chunk of every variable: those of a movie shard.
+        Frames in an inner chunk of every variable: those of a movie shard.
     about
         Attributes under :data:`stores.ATTRIBUTE`.
     """
     sizes = {"frame": len(time), "column_id": columns.sizes["column_id"]} | schema.SIZES
     known = {"drift_measured": drift, "time": time}
     static = columns.assign_coords(schema.coordinates(len(time)))
-    static = static.assign({name: (schema.RESULTS[name].dims, known[name]) for name in _KNOWN_AT_START})
+    static = static.assign({name: (schema.RESULTS[name].dims, values) for name, values in known.items()})
     static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
-    for name in (*_KNOWN_AT_START, *schema.COLUMNS):
+    for name in (*known, *schema.COLUMNS):
         static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
     static.attrs = {name: about.get(name) for name in CALIBRATION}
     static.attrs[stores.ATTRIBUTE] = stores.json_ready({**about, "complete": False})
     aside = path.with_name(f".{path.name}.partial")
+    step = min(frames_per_shard, len(time))
+    per_file = _per_file(-(-len(time) // step), 8 * step * sizes["column_id"] * sizes["parameter"])
     with stores.disk_errors(path):
         stores.remove(aside)
-        static.to_zarr(aside, mode="w", zarr_format=3, consolidated=False)
+        stores.write_arrays(static, aside)
         group = zarr.open_group(str(aside), mode="a")
         for variable in map(schema.RESULTS.__getitem__, SHARDED):
             shape = tuple(sizes[dim] for dim in variable.dims)
             group.create_array(
                 variable.name,
                 shape=shape,
-                chunks=(min(frames_per_shard, shape[0]), *shape[1:]),
+                chunks=(step, *shape[1:]),
+                shards=(step * per_file, *shape[1:]),
                 dtype=variable.dtype,
-                compressors=BloscCodec(**BLOSC[_CODEC]),
+                compressors=codecs(CODEC),
+                chunk_key_encoding=CHUNK_KEYS,
                 fill_value=variable.fill,
                 dimension_names=variable.dims,
                 attributes=variable.attributes,
             )
+        stores.seal(aside)
         stores.remove(path)
-        aside.replace(path)
+        disk.place_folder(aside, path)
 
 
-def write(path: Path, shard: Shard, values: dict[str, np.ndarray[Any, Any]], frames_per_shard: int) -> None:
-    """Write the values of every variable for the frames of ``shard``: one whole chunk each, encoded here.
+def _per_file(n_shards: int, shard_bytes: int) -> int:
+    """Return the shards that share a file, where the largest variable has ``shard_bytes`` a shard.
 
-    Chunks have the frames of a whole shard; that of the last shard is filled up.
+    Examples
+    --------
+    >>> _per_file(1000, 1000), _per_file(1000, 10 << 20), _per_file(1000, 1 << 30), _per_file(5, 1000)
+    (64, 12, 8, 5)
     """
-    for name, array in values.items():
-        variable = schema.RESULTS[name]
-        chunk = np.full((frames_per_shard, *array.shape[1:]), variable.fill, variable.dtype)
-        chunk[: shard.frames] = array
-        place = path.joinpath(name, "c", str(shard.index), *["0"] * (array.ndim - 1))
-        with stores.disk_errors(path):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            stores.write_aside(place, bytes(encode(chunk, _CODEC)))
+    fewest, most = _FILE_SHARDS
+    return min(n_shards, max(fewest, min(most, _FILE_BYTES // shard_bytes)))
+
+
+def finish(path: Path, **about: Any) -> None:
+    """Say that the store is complete, once all files of its variables are on disk."""
+    with stores.disk_errors(path):
+        disk.sync_folders(path)
+    stores.update_attributes(path, complete=True, **about)
 
 
 def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
     if any(stores.attributes(path).get(name) != value for name, value in about.items()):
-        zarr.open_array(str(path / "time"), mode="r+")[...] = time
+        stores.overwrite_array(path / "time", time)
         stores.update_attributes(path, plain=about, **about)
 
 
 def finished_shards(path: Path) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return which shards of the store at ``path`` are done, (shards,); of a finished store, all.
 
-    Those that are not may hold values already: of a task that was killed before its entry in the journal.
+    Raises
+    ------
+    MissingStoreError
+        Where there are no results.
+    """
+    parts = _parts(path)
+    if parts is not None:
+        return parts.done
+    n_frames, step, _ = layout(path)
+    return np.full(-(-n_frames // step), bool(stores.attributes(path).get("complete")))
+
+
+def variables(path: Path) -> Callable[[str], Any]:
+    """Return what opens a variable of the store at ``path`` by its name, to be sliced along its frames.
+
+    Of a store whose fits are not all done it is at the fill value where they are not.
 
     Raises
     ------
     MissingStoreError
         Where there are no results.
     """
+    parts = _parts(path)
+
+    def opened(name: str) -> Any:
+        array = stores.open_array(path / name)
+        return array if parts is None or name not in SHARDED else Growing(array, name, parts)
+
+    return opened
+
+
+def growing_files(path: Path) -> list[tuple[Path, Iterator[bytes]]]:
+    """Return the files that the finished shards of a store would make, and their bytes; none of a complete one."""
+    parts = _parts(path)
+    if parts is None:
+        return []
+    _, _, per_file = layout(path)
+    found = []
+    for number, start in enumerate(range(0, len(parts.done), per_file)):
+        shards = range(start, min(start + per_file, len(parts.done)))
+        if parts.done[shards].any():
+            for name in SHARDED:
+                file = chunk_path(path / name, number, *file_place(name))
+                found.append((file, joined(parts, name, shards, per_file)))
+    return found
+
+
+def stored_bytes(path: Path) -> int:
+    """Return about how many bytes the fits take on disk, those that are done."""
+    parts = _parts(path)
+    if parts is not None:
+        return sum((parts.run / name).stat().st_size for name in parts.files)
+    return sum(file.stat().st_size for name in SHARDED for file in (path / name).glob("c.*"))
+
+
+def _parts(path: Path) -> Parts | None:
+    """Return what is fitted of a store that is not complete; None where it is, or nothing is known of its fits."""
     about = stores.attributes(path)
     if not (path / "fit").is_dir():
         raise _nothing_here(path)
-    fit = stores.open_array(path / "fit")
-    done = np.full(-(-fit.shape[0] // fit.chunks[0]), bool(about.get("complete")))
-    journal = journal_beside(path)
-    with suppress(FileNotFoundError):
-        if not done.all() and (journal / "key").read_text(encoding="utf-8") == about.get("key"):
-            done[[index for index, _ in entries(journal) if index < len(done)]] = True
-    return done
+    journal = None if about.get("complete") else Journal.existing(journal_beside(path), str(about.get("key")))
+    if journal is None:
+        return None
+    n_frames, step, _ = layout(path)
+    return Parts.of(journal, n_frames, step)
 
 
 def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
@@ -159,8 +217,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
             str(path),
             remedy="Run the same command again to finish, or open it with unfinished=True",
         )
-    with stores.codec_pipeline():
-        stored: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
+    stored = stores.open_lazily(path, partial=not about.get("complete"))
     if lacking := [name for name in (*schema.RESULTS, *schema.COLUMNS) if name not in stored]:
         raise MissingStoreError(
             "these results are of another version",
@@ -172,10 +229,24 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
     dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
+    if not about.get("complete"):
+        dataset = _grown(dataset, path)
     dataset.attrs |= {name: about.get(name) for name in CALIBRATION}
     settings = from_toml(FitSettings, about["settings"], str(path))
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
     return dataset
+
+
+def _grown(dataset: xr.Dataset, path: Path) -> xr.Dataset:
+    """Return the Dataset of a store that is not complete, with what is fitted so far."""
+    import dask.array as da  # takes its time, and workers do not need it
+
+    opened = variables(path)
+    lazy = {
+        name: da.from_array(opened(name), chunks=dataset[name].data.chunksize, name=False, fancy=False)
+        for name in SHARDED
+    }
+    return dataset.assign({name: dataset[name].copy(data=values) for name, values in lazy.items()})
 
 
 def _nothing_here(path: Path) -> MissingStoreError:

@@ -1,8 +1,9 @@
 """The shard files of a movie: tiles, encoded and decoded straight between the file and memory that is used again.
 
-A file holds what Zarr v3's ``sharding_indexed`` codec writes: the encoded tiles; then, for every tile of the shard in C
-order, its offset and length (uint64, little-endian), both 2^64 - 1 where a tile is not stored; then the CRC-32C of that
-index. General codec pipelines allocate the buffers of every tile and every shard anew, which costs as much as encoding.
+A file holds what Zarr v3's ``sharding_indexed`` codec writes: the encoded tiles, each followed by its CRC-32C; then,
+for every tile of the shard in C order, its offset and length (uint64, little-endian), both 2^64 - 1 where a tile is not
+stored; then the CRC-32C of that index. General codec pipelines allocate the buffers of every tile and every shard anew,
+which costs as much as encoding.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 import os
 import uuid
 from collections.abc import Iterator
+from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 from types import TracebackType
@@ -18,14 +20,21 @@ from typing import Any, NamedTuple
 
 import google_crc32c
 import imagecodecs
+import imagecodecs._blosc  # which imagecodecs would import in the first tasks, several threads at once
 import numpy as np
 from numpy.typing import NDArray
+
+from . import disk
 
 Pixels = NDArray[Any]
 
 _blosc: Any = imagecodecs  # its annotations leave out arrays, which it takes
-_ABSENT = np.uint64(2**64 - 1)
-_CHECKSUM_BYTES = 4
+ABSENT = 2**64 - 1
+"""Offset and length of a tile that is not stored."""
+
+CHECKSUM_BYTES = 4
+"""Bytes of a CRC-32C, behind the data that it is of."""
+
 _BLOSC_HEADER_BYTES = 16
 
 BLOSC: dict[str, dict[str, Any]] = {
@@ -49,9 +58,58 @@ class Grid(NamedTuple):
         return layers, rows, columns
 
 
-def shard_path(array: Path, index: int) -> Path:
-    """Return the file of a shard of the array at a path."""
-    return array / "c" / str(index) / "0" / "0"
+SEPARATOR = "."
+"""What stands between the numbers in a chunk's name: a full stop, so that a chunk costs a file and no folders."""
+
+CHUNK_KEYS: Any = {"name": "default", "separator": SEPARATOR}
+"""The same, as Zarr takes it for a new array."""
+
+
+def chunk_path(array: Path, *place: int, separator: str = SEPARATOR) -> Path:
+    """Return the file of a chunk, or of a shard, by its numbers along the axes of the array at a path.
+
+    Examples
+    --------
+    >>> chunk_path(Path("movie.zarr/0"), 3, 0, 0).as_posix()
+    'movie.zarr/0/c.3.0.0'
+    """
+    return array / separator.join(["c", *map(str, place)])
+
+
+def codecs(codec: str) -> list[dict[str, Any]]:
+    """Return Zarr's names of what encodes a tile's bytes, in order: Blosc unless ``codec`` is ``none``; CRC-32C."""
+    blosc = [{"name": "blosc", "configuration": BLOSC[codec]}] if codec in BLOSC else []
+    return [*blosc, {"name": "crc32c"}]
+
+
+def crc32c(data: Any) -> int:
+    """Return the CRC-32C of contiguous bytes, or of an array's.
+
+    Examples
+    --------
+    >>> hex(crc32c(b"123456789"))
+    '0xe3069283'
+    """
+    return int(google_crc32c.value(np.frombuffer(data, np.uint8)))
+
+
+def checksum(data: Any) -> bytes:
+    """Return the CRC-32C of contiguous data as Zarr's ``crc32c`` codec writes it behind them."""
+    return crc32c(data).to_bytes(CHECKSUM_BYTES, "little")
+
+
+def unchecked(data: memoryview) -> memoryview:
+    """Return data without the CRC-32C at their end, which is checked.
+
+    Raises
+    ------
+    ValueError
+        Where it is that of other data.
+    """
+    inner = data[:-CHECKSUM_BYTES]
+    if len(data) < CHECKSUM_BYTES or checksum(inner) != data[-CHECKSUM_BYTES:]:
+        raise ValueError("its checksum is that of other data")
+    return inner
 
 
 def encode(values: Pixels, codec: str, into: NDArray[np.uint8] | None = None) -> Any:
@@ -93,8 +151,9 @@ def decode(data: memoryview, out: Pixels, *, encoded: bool) -> None:
 class ShardWriter:
     """Writes one shard, frame by frame: aside first; in its place once the block of the ``with`` statement is over.
 
-    Neither a killed task nor a second copy of it can leave a shard that is half written. Frames are laid into the tiles
-    of the current layer, which are encoded once the layer is full, or the movie ends.
+    In an open batch (:func:`tract_dask.disk.together`) it is there once that is committed. Neither a killed task nor a
+    second copy of it can leave a shard that is half written. Frames are laid into the tiles of the current layer, which
+    are encoded once the layer is full, or the movie ends.
 
     Parameters
     ----------
@@ -108,7 +167,7 @@ class ShardWriter:
         self._path, self._aside, self._codec = path, aside / f"{uuid.uuid4().hex}.partial", codec
         layers, rows, columns = grid.tiles
         depth, height, width = grid.chunk
-        self._index = np.full((layers, rows, columns, 2), _ABSENT, "<u8")
+        self._index = np.full((layers, rows, columns, 2), ABSENT, "<u8")
         self._layer = np.zeros((rows, columns, depth, height, width), dtype)
         self._encoded = np.empty(self._layer[0, 0].nbytes + _BLOSC_HEADER_BYTES, np.uint8)
         self._frames, self._offset = 0, 0
@@ -131,15 +190,14 @@ class ShardWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
+        with ExitStack() as stack:
+            stack.callback(self._aside.unlink, missing_ok=True)
             with self._file:
-                if error is None:
-                    self._finish()
-            if error is None:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._aside.replace(self._path)
-        finally:
-            self._aside.unlink(missing_ok=True)
+                if error is not None:
+                    return
+                self._finish()
+            disk.place(self._aside, self._path)
+            stack.pop_all()
 
     def _finish(self) -> None:
         """Write the layer that the movie's end leaves unfinished, filled up with zeros, and the index."""
@@ -148,63 +206,93 @@ class ShardWriter:
             self._layer[:, :, place:] = 0
             self._encode(layer)
         index = self._index.tobytes()
-        self._write(memoryview(index + _checksum(index)))
+        self._write(index, checksum(index))
 
     def _encode(self, layer: int) -> None:
+        began = self._offset
         for row, column in np.ndindex(self._layer.shape[:2]):
-            data = memoryview(encode(self._layer[row, column], self._codec, self._encoded)).cast("B")
-            self._index[layer, row, column] = self._offset, len(data)
-            self._write(data)
+            data = encode(self._layer[row, column], self._codec, self._encoded)
+            offset = self._offset
+            self._write(data, checksum(data))
+            self._index[layer, row, column] = offset, self._offset - offset
+        disk.write_back(self._file.fileno(), began, self._offset - began)
 
-    def _write(self, data: memoryview) -> None:
-        """Write all of ``data``: one call of the system may take less."""
-        self._offset += len(data)
-        while len(data):
-            data = data[self._file.write(data) :]
+    def _write(self, data: Any, behind: bytes) -> None:
+        """Write data and what stands behind them: one call of the system may take less."""
+        parts = [memoryview(data).cast("B"), memoryview(behind)]
+        self._offset += sum(map(len, parts))
+        while parts:
+            written = os.writev(self._file.fileno(), parts)
+            while parts and written >= len(parts[0]):
+                written -= len(parts.pop(0))
+            if parts:
+                parts[0] = parts[0][written:]
+
+
+def read_index(handle: int, tiles: tuple[int, ...]) -> NDArray[np.uint64]:
+    """Return the index at the end of an open shard file: offset and length of each tile, (..., 2).
+
+    Raises
+    ------
+    ValueError
+        Where it is damaged.
+    """
+    index_bytes = 16 * math.prod(tiles) + CHECKSUM_BYTES
+    tail = os.pread(handle, index_bytes, max(0, os.fstat(handle).st_size - index_bytes))
+    try:
+        index: NDArray[np.uint64] = np.frombuffer(unchecked(memoryview(tail)), "<u8").reshape(*tiles, 2)
+    except ValueError as error:
+        raise ValueError("the index at the end is damaged") from error
+    return index
 
 
 class ShardReader:
-    """Reads tiles of one shard.
+    """Reads tiles of one shard, and checks each.
+
+    Parameters
+    ----------
+    encoded
+        Whether tiles went through Blosc.
+    checked
+        Whether a CRC-32C follows each tile, as it does since format 2.
 
     Raises
     ------
     OSError
         Where the file is missing or cannot be read.
     ValueError
-        Where its index or a tile is damaged.
+        Where its index or a tile is damaged, or a tile is not stored.
     """
 
-    def __init__(self, path: Path, grid: Grid, dtype: np.dtype[Any], *, encoded: bool) -> None:
-        self._path, self._grid, self._encoded = path, grid, encoded
+    def __init__(self, path: Path, grid: Grid, dtype: np.dtype[Any], *, encoded: bool, checked: bool = True) -> None:
+        self._path, self._grid, self._encoded, self._checked = path, grid, encoded, checked
         self._scratch = np.empty(grid.chunk, dtype)
 
     def __enter__(self) -> ShardReader:
         self._file = self._path.open("rb", buffering=0)
-        index_bytes = 16 * math.prod(self._grid.tiles) + _CHECKSUM_BYTES
-        tail = os.pread(self._file.fileno(), index_bytes, max(0, os.fstat(self._file.fileno()).st_size - index_bytes))
-        index, checksum = tail[:-_CHECKSUM_BYTES], tail[-_CHECKSUM_BYTES:]
-        if len(tail) != index_bytes or checksum != _checksum(index):
+        try:
+            self._index = read_index(self._file.fileno(), self._grid.tiles)
+        except (OSError, ValueError):
             self._file.close()
-            raise ValueError(f"the index at the end of {self._path} is damaged")
-        self._index = np.frombuffer(index, "<u8").reshape(*self._grid.tiles, 2)
+            raise
         lengths = self._index[..., 1]
-        self._stored = memoryview(bytearray(int(lengths.max(where=lengths != _ABSENT, initial=0))))
+        self._stored = memoryview(bytearray(int(lengths.max(where=lengths != ABSENT, initial=0))))
         return self
 
     def __exit__(self, *error: object) -> None:
         self._file.close()
 
     def read_tile(self, layer: int, row: int, column: int, out: Pixels) -> None:
-        """Decode a tile into ``out``, contiguous and as large as a tile; zeros where it is not stored."""
+        """Decode a tile into ``out``, contiguous and as large as a tile."""
         offset, length = self._index[layer, row, column].tolist()
-        if offset == _ABSENT:
-            out[...] = 0
-            return
+        if offset == ABSENT:
+            raise ValueError(f"tile {layer, row, column} is missing")
         try:
             count = os.preadv(self._file.fileno(), [self._stored[:length]], offset)
-            decode(self._stored[:count], out, encoded=self._encoded)
+            data = self._stored[:count]
+            decode(unchecked(data) if self._checked else data, out, encoded=self._encoded)
         except ValueError as error:
-            raise ValueError(f"tile {layer, row, column} of {self._path} is damaged: {error}") from error
+            raise ValueError(f"tile {layer, row, column} is damaged: {error}") from error
 
     def read(self, part: tuple[slice, slice, slice], out: Pixels) -> None:
         """Decode a part of the shard, its frames, rows and columns, into ``out``."""
@@ -220,7 +308,3 @@ def overlaps(span: slice, side: int) -> Iterator[tuple[int, slice, slice]]:
         first, last = max(span.start, number * side), min(span.stop, (number + 1) * side)
         inside = slice(first - number * side, last - number * side)
         yield number, inside, slice(first - span.start, last - span.start)
-
-
-def _checksum(data: bytes) -> bytes:
-    return int(google_crc32c.value(data)).to_bytes(_CHECKSUM_BYTES, "little")

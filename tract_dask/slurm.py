@@ -12,7 +12,7 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Any
 
-from . import forkserver
+from . import deaths, forkserver
 from .errors import ClusterError
 from .settings import ClusterSettings
 from .tls import security
@@ -87,7 +87,7 @@ def _arguments(settings: ClusterSettings, memory_limit: int) -> dict[str, Any]:
         "python": settings.python,
         "local_directory": settings.local_directory,
         "death_timeout": 60,
-        "worker_extra_args": ["--lifetime", f"{lifetime_s(slurm.walltime)}s"],
+        "worker_extra_args": ["--lifetime", f"{lifetime_s(slurm.walltime)}s", "--preload-nanny", deaths.MODULE],
         "security": security(settings.tls),
         "protocol": "tls://" if settings.tls else "tcp://",
         "name": "tract",
@@ -138,7 +138,7 @@ async def _correct(cluster: Any, jobs: int, ended_jobs: set[str]) -> None:
 def lifetime_s(walltime: str) -> int:
     """Return how long (s) a worker takes tasks: it leaves in good order before SLURM ends its job.
 
-    One that is killed with its job loses its task, and a task that is lost four times is given up.
+    One that is killed with its job loses what it was doing.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from time import monotonic, sleep
 from distributed import LocalCluster
 from distributed.utils import get_ip, get_ip_interface
 
-from . import forkserver
+from . import deaths, forkserver
 from .errors import ClusterError, SettingsError
 from .settings import ClusterSettings
 from .supervision import Supervised
@@ -84,6 +84,8 @@ def _worker_command(address: str, settings: ClusterSettings, memory_limit: int |
         "--death-timeout",
         "60",
         "--no-dashboard",
+        "--preload-nanny",
+        deaths.MODULE,
         *scratch,
         *flags,
     ]

@@ -10,7 +10,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,12 +21,14 @@ import xarray as xr
 from distributed import Client
 
 from . import fit, stores
-from .conversion import convert, movie_key
+from .conversion import convert, is_converted
 from .drift import estimate_drift
 from .errors import DestinationError
 from .io import FrameSource
-from .journal import journal_beside
+from .journal import journal_beside, remove_journal
+from .keyed import counted
 from .movie import Movie, open_movie
+from .pixel_range import check_pixels
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import Status
@@ -37,6 +41,10 @@ Workers = Callable[[], Client]
 
 Aside = Callable[[Callable[[], object]], object]
 """Takes work that nothing waits for but the end of the run."""
+
+
+_OUR_TABLE = b"column_id,x,y,kind,"
+"""How a table begins that a run has written."""
 
 
 def at_once(work: Callable[[], object]) -> object:
@@ -54,27 +62,29 @@ def convert_stage(
     overwrite: bool = False,
 ) -> Movie:
     """Return the movie at ``path``, converted if it is not there yet; its metadata are made those of ``source``."""
-    done = _is_done(path, movie_key(source, settings.convert, settings.source))
+    done = is_converted(path, source, settings.convert, settings.source)
     convert(
         source,
         path,
         settings=settings.convert,
         source_settings=settings.source,
+        metadata=settings.metadata,
         client=None if done else workers(),
         on_event=on_event,
         overwrite=overwrite,
     )
-    return open_movie(path)
+    movie = open_movie(path)
+    if coarse := check_pixels(movie.statistics(), source.path):
+        on_event(Warned(coarse))
+    return movie
 
 
 def drift_stage(
     movie: Movie, path: Path, settings: DriftSettings, workers: Workers, on_event: Sink = silent
 ) -> xr.Dataset:
     """Return the drift of ``movie``, kept at ``path``."""
-    measured = dataclasses.replace(
-        settings, csv=None, refine=True, refine_columns=10
-    )  # what the measurement depends on
-    key = stage_key(movie.key, measured, _content(settings.csv))
+    given = _content(settings.csv) if settings.method == "csv" else b""
+    key = stage_key("drift", movie.key, counted("drift", drift=settings), given)
 
     def make(journal: Path) -> xr.Dataset:
         client = workers() if settings.method == "auto" else None
@@ -87,8 +97,8 @@ def sum_stage(
     movie: Movie, drift: xr.Dataset | None, path: Path, workers: Workers, on_event: Sink = silent
 ) -> xr.Dataset:
     """Return the drift-corrected sum of ``movie``, kept at ``path``."""
-    moved = [] if drift is None else [drift[name].to_numpy().tobytes() for name in ("drift", "quality")]
-    key = stage_key(movie.key, repr(movie.gain), *moved)
+    moved = [] if drift is None else [drift[name].to_numpy() for name in ("drift", "quality")]
+    key = stage_key("sum", movie.key, counted("sum"), movie.gain, *moved)
 
     def make(journal: Path) -> xr.Dataset:
         return sum_image(movie, drift, client=workers(), on_event=on_event, journal=journal)
@@ -109,22 +119,21 @@ def columns_stage(
     """Return the columns of a summed image, kept as the table ``csv``, with ``.zarr`` and ``.png`` of the same name.
 
     Where the table was edited by hand since, its columns are refined and returned instead, and the table is left
-    as it is. The figure is drawn by ``aside``.
+    as it is, whatever other setting changes; only another method or file of columns takes its place, after it was put
+    away. The figure is drawn by ``aside``.
 
     Raises
     ------
     DestinationError
         Where ``csv`` is a table of other origin.
     """
-    store, figure = csv.with_suffix(".zarr"), csv.with_suffix(".png")
-    plain = dataclasses.replace(settings, csv=None)
-    window, blur = fit_settings.window_px, fit_settings.blur_sigma_px
     from .columns import find_columns  # workers, which are forked once this room is imported, do not need it
 
+    store, figure = csv.with_suffix(".zarr"), csv.with_suffix(".png")
+    window, blur = fit_settings.window_px, fit_settings.blur_sigma_px
     find = partial(find_columns, summed, window_px=window, blur_sigma_px=blur)
-    key = stage_key(summed["image"].to_numpy().tobytes(), plain, _content(settings.csv), f"{window} {blur}")
-    about, table, pixel_size = stores.attributes(store), _content(csv), summed.attrs.get("pixel_size_pm")
-    if table and not about and not overwrite:
+    before = _Table.read(csv, settings)
+    if before.is_foreign and not overwrite:
         raise DestinationError(
             "this table was not written by tract-dask",
             str(csv),
@@ -132,32 +141,112 @@ def columns_stage(
             "another file",
             "Choose another place, say --overwrite, or give the table as --columns",
         )
-    edited = bool(table and about) and _digest(table) != about.get("table")
-    same = bool(table) and about.get("key") == key
-    if same and not edited and figure.exists() and about.get("pixel_size_pm") == pixel_size:
+    counts = counted("columns", columns=settings, fit=fit_settings)
+    key = stage_key("columns", summed["image"].to_numpy(), counts, before.seeds)
+    about, pixel_size = before.about, summed.attrs.get("pixel_size_pm")
+    same = bool(before.content) and about.get("key") == key
+    if same and figure.exists() and about.get("pixel_size_pm") == pixel_size:
         on_event(StageDone("columns", 0.0, reused=True))
         return _reopened(store)
     began = perf_counter()
     on_event(StageStarted("columns", 0))
-    if same and edited:
-        on_event(Warned(f"{csv.name} was edited: your columns are kept, and refined on the summed image"))
-        found = find(dataclasses.replace(settings, method="csv", csv=str(csv)))
+    if same:
+        found, edited = _reopened(store), before.is_edited
     else:
-        found = _reopened(store) if same else find(settings)
+        found, edited = _found(find, before, settings, on_event)
+        key = stage_key("columns", summed["image"].to_numpy(), counts, before.content if edited else before.given)
     found.attrs["pixel_size_pm"] = pixel_size
-    by_hand = edited or bool(about.get("edited"))
-    if not same:
-        if by_hand and table:
-            _put_away(csv, on_event)
-        table, by_hand = _render(found, csv), False
-        csv.unlink(missing_ok=True)  # before the store, which would else take the old table for an edited one
-    _save(found, store, key, settings, "columns", pixel_size_pm=pixel_size, table=_digest(table), edited=by_hand)
+    table = before.content if same or edited else _render(found, csv)
+    if table != before.content:
+        before.make_room(on_event)  # before the store, which would else take the old table for an edited one
+    known = {"table": _digest(table), "edited": edited, "seeds": before.origin, "pixel_size_pm": pixel_size}
+    _save(found, store, key, settings, "columns", **known)
     if not csv.exists():
         stores.write_aside(csv, table)
     figure.unlink(missing_ok=True)  # it is of other columns
     aside(partial(_draw, summed, found.copy(), figure))
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
     return found
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A table of columns that an earlier run may have left.
+
+    Attributes
+    ----------
+    content
+        What it holds; empty where there is none.
+    about
+        What the store beside it says of itself.
+    given
+        What the file holds that the settings name for method csv; empty for other methods.
+    origin
+        What the settings take columns from. Another origin ends what was edited.
+    is_given
+        Whether the settings name this very table.
+    """
+
+    csv: Path
+    content: bytes
+    about: dict[str, Any]
+    given: bytes
+    origin: dict[str, str]
+    is_given: bool
+
+    @classmethod
+    def read(cls, csv: Path, settings: ColumnSettings) -> _Table:
+        by_file = settings.method == "csv" and settings.csv is not None
+        given = _content(settings.csv) if by_file else b""
+        origin = {"method": settings.method, "csv": _digest(given)}
+        about = stores.attributes(csv.with_suffix(".zarr"))
+        return cls(csv, _content(csv), about, given, origin, by_file and Path(settings.csv or "").absolute() == csv)
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether it is not as a run has written it."""
+        found = bool(self.content and self.about)
+        return found and (_digest(self.content) != self.about.get("table") or bool(self.about.get("edited")))
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether it is none that a run has written."""
+        return bool(self.content) and not self.about and not self.content.startswith(_OUR_TABLE) and not self.is_given
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether its columns are to be refined, and not found anew."""
+        return bool(self.content) and (
+            self.is_given or (self.is_changed and self.about.get("seeds", self.origin) == self.origin)
+        )
+
+    @property
+    def seeds(self) -> bytes:
+        """The table that columns are taken from; empty where they are looked for."""
+        return self.content if self.is_edited else self.given
+
+    def make_room(self, on_event: Sink) -> None:
+        """Take the table away for another: for ever, where it is as a run has written it."""
+        now = _content(self.csv)
+        if now and (self.is_changed or not self.about or now != self.content):
+            put_away(self.csv, on_event)
+        self.csv.unlink(missing_ok=True)
+
+
+def _found(
+    find: Callable[[ColumnSettings], xr.Dataset], before: _Table, settings: ColumnSettings, on_event: Sink
+) -> tuple[xr.Dataset, bool]:
+    """Return the columns that an edited table or else the settings lead to, and whether the table does.
+
+    A table of ours whose store is gone is an edited one, unless it is just what the settings lead to.
+    """
+    lost = bool(before.content) and not before.about and not before.is_foreign
+    if not before.is_edited:
+        found = find(settings)
+        if not lost or _render(found, before.csv) == before.content:
+            return found, False
+    on_event(Warned(f"{before.csv.name} was edited: your columns are kept, and refined on the summed image"))
+    return find(dataclasses.replace(settings, method="csv", csv=str(before.csv))), True
 
 
 def fit_stage(
@@ -206,7 +295,7 @@ def _kept(
             "Choose another place",
         )
     if _is_done(path, key):
-        stores.remove(journal_beside(path))  # of a run that was killed just before it had removed it
+        remove_journal(journal_beside(path))  # of a run that was killed just before it had removed it
         on_event(StageDone(stage, 0.0, reused=True))
         dataset = stores.open_dataset(path)
         if dataset.attrs.get("pixel_size_pm") == movie.pixel_size_pm:
@@ -216,7 +305,7 @@ def _kept(
         dataset = make(journal)
     dataset.attrs["pixel_size_pm"] = movie.pixel_size_pm
     _save(dataset, path, key, settings, stage, source=str(movie.path))
-    stores.remove(journal_beside(path))
+    remove_journal(journal_beside(path))
     return dataset
 
 
@@ -269,8 +358,22 @@ def _columns_summary(columns: xr.Dataset) -> str:
     return ", ".join(filter(None, parts))
 
 
-def _put_away(csv: Path, on_event: Sink) -> None:
-    """Keep a table that was edited by hand under another name, before a new one takes its place."""
-    kept = csv.with_stem(f"{csv.stem}-edited")
+def put_away(csv: Path, on_event: Sink) -> None:
+    """Keep a table that was edited by hand under another name, under which nothing lies yet."""
+    names = (csv.with_stem(f"{csv.stem}-edited{suffix}") for suffix in chain([""], (f"-{k}" for k in count(2))))
+    kept = next(path for path in names if not path.exists() or path.read_bytes() == csv.read_bytes())
     csv.replace(kept)
-    on_event(Warned(f"the settings of the columns have changed: your edited {csv.name} is now {kept.name}"))
+    on_event(Warned(f"other columns take the place of {csv.name}: your edited table is now {kept.name}"))
+
+
+def clear_columns(csv: Path, on_event: Sink, *, keep_edited: bool) -> None:
+    """Remove what the columns stage has left at ``csv``; a table that was edited by hand is kept, or put away."""
+    before = _Table.read(csv, ColumnSettings())
+    edited = before.is_changed or bool(before.content and not before.about)
+    csv.with_suffix(".png").unlink(missing_ok=True)
+    if edited and keep_edited and not before.is_foreign:
+        return
+    if edited:
+        put_away(csv, on_event)
+    csv.unlink(missing_ok=True)
+    stores.remove(csv.with_suffix(".zarr"))

@@ -1,4 +1,4 @@
-"""Zarr and the file system: opening arrays with the fast codec pipeline, writing aside, checking destinations."""
+"""Zarr and the file system: stores written whole and opened with checks, writing aside, checking destinations."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from time import monotonic, sleep
 from typing import Any, Literal
 
@@ -18,22 +18,25 @@ import numpy as np
 import xarray as xr
 import zarr
 from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from . import disk
+from .damage import CHECKED, METADATA, damaged, read_json, reading, unreadable
 from .errors import DestinationError, MissingStoreError, StoreError
 from .schema import texts
+from .shard_files import CHUNK_KEYS, crc32c
 
 ATTRIBUTE = "tract_dask"
 """Name of the attribute under which every store keeps its provenance and its own metadata."""
 
+FORMAT = 2
+"""Number of the format in which stores are written. In format 1 chunks had no checksums, and stores no number."""
 
-@contextmanager
-def codec_pipeline() -> Iterator[None]:
-    """Open arrays inside this block with the ``zarrs`` codec pipeline, where it is installed; it reads faster."""
-    if find_spec("zarrs") is None:
-        yield
-        return
-    with zarr.config.set({"codec_pipeline.path": "zarrs.ZarrsCodecPipeline"}):
-        yield
+_WRITE_ALL = {"array.write_empty_chunks": True}
+"""Zarr's configuration in which every chunk is written: one that is missing is an error, never the fill value."""
+
+_MARKS = ("frame_bad_pixels", "fit_ref", "quality", "exposure")
+"""Arrays by which our stores are known where they do not say what they are."""
 
 
 @contextmanager
@@ -58,28 +61,58 @@ def load_array(path: Path, mmap_mode: Literal["r"] | None = None) -> NDArray[Any
 
 
 def open_array(path: Path) -> zarr.Array[Any]:
-    """Return the Zarr array at ``path``, to be read.
+    """Return the Zarr array at ``path``, to be read; where its store is complete, a missing chunk is an error.
 
     Raises
     ------
     StoreError
-        Where there is no array.
+        Where there is no array, or its metadata are damaged; when it is read, where a chunk is damaged or missing.
     """
+    store, about = _store_around(path)
+    _check_nodes(store, about, [path.relative_to(store).as_posix()])
     try:
-        with codec_pipeline():
+        with _configured(CHECKED if _is_whole(about) else {}), _opening(path):
             return zarr.open_array(str(path), mode="r", zarr_format=3)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError) as error:
         raise StoreError("there is no Zarr array here", str(path), remedy="Run the stage that writes it") from error
 
 
 def attributes(path: Path) -> dict[str, Any]:
-    """Return what the store at ``path`` says of itself under :data:`ATTRIBUTE`; empty where there is no such store."""
-    try:
-        metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    """Return what the store at ``path`` says of itself under :data:`ATTRIBUTE`; empty where there is no such store.
+
+    Raises
+    ------
+    StoreError
+        Where it is damaged, or cannot be read.
+    MissingStoreError
+        Where a newer version of the package wrote it.
+    """
+    file = path / METADATA
+    metadata = read_json(file)
+    found = metadata.get("attributes", {}).get(ATTRIBUTE)
+    if not isinstance(found, dict):
+        if any((path / name / METADATA).exists() for name in _MARKS):
+            raise damaged(file, "no metadata of tract_dask" if metadata else "no such file")
         return {}
-    found = metadata.get("attributes", {}).get(ATTRIBUTE, {})
-    return found if isinstance(found, dict) else {}
+    number, checksum = format_of(found), found.pop("checksum", None)
+    if (checksum is not None or number != 1) and checksum != digest(metadata):
+        raise damaged(file, "its checksum is that of other data: it was damaged, or changed by another program")
+    if number > FORMAT:
+        version = found.get("versions", {}).get("tract_dask", "unknown")
+        raise MissingStoreError(
+            "a newer version of tract_dask wrote this store",
+            str(path),
+            f"format {FORMAT} or older",
+            f"format {number}, of version {version}",
+            "Install that version or a newer one, or remove the store and make it anew",
+        )
+    return found
+
+
+def format_of(about: Mapping[str, Any]) -> int:
+    """Return the number of a store's format, by its attributes; 1 for stores that have none."""
+    number = about.get("format")
+    return number if isinstance(number, int) else 1  # in format 1 it was that of a movie's source
 
 
 def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **changes: Any) -> None:
@@ -87,32 +120,164 @@ def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **c
 
     ``plain`` are attributes that stand beside :data:`ATTRIBUTE`, for other readers.
     """
-    file = path / "zarr.json"
-    metadata = json.loads(file.read_text(encoding="utf-8"))
-    attributes = metadata.setdefault("attributes", {})
-    attributes.update(plain or {})
-    attributes.setdefault(ATTRIBUTE, {}).update(changes)
-    write_aside(file, json.dumps(metadata, indent=2).encode())
+    attributes(path)  # refuses one that is damaged
+    metadata = read_json(path / METADATA)
+    known = metadata.setdefault("attributes", {})
+    known.update(plain or {})
+    known.setdefault(ATTRIBUTE, {}).update(changes)
+    write_root(path, metadata)
+
+
+def write_root(path: Path, metadata: dict[str, Any], changed: Collection[str] = ()) -> None:
+    """Write the root's metadata of a store, with the number of the format and checksums of all metadata.
+
+    Parameters
+    ----------
+    changed
+        Arrays whose metadata have changed since the root was last written; of all where that was never.
+    """
+    ours = metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {})
+    known = ours.get("arrays")
+    names = _nodes(path) if known is None else changed
+    ours["arrays"] = (known or {}) | {name: digest(read_json(path / name / METADATA)) for name in names}
+    ours["format"] = FORMAT
+    ours.pop("checksum", None)
+    metadata = json_ready(metadata)
+    ours = metadata["attributes"][ATTRIBUTE]
+    ours["checksum"] = digest(metadata)
+    write_aside(path / METADATA, json.dumps(metadata, indent=2).encode())
+
+
+def seal(path: Path) -> None:
+    """Give a new store the number of the format and checksums of the metadata of all its arrays."""
+    metadata = read_json(path / METADATA)
+    metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {}).pop("arrays", None)
+    write_root(path, metadata)
+
+
+def nodes(store: Path) -> list[str]:
+    """Return the names of the arrays and groups that a store holds, or should."""
+    about = attributes(store)
+    return list(about["arrays"] if "arrays" in about else _nodes(store))
+
+
+def read_node(store: Path, name: str) -> dict[str, Any]:
+    """Return the metadata of an array or group of a store, checked.
+
+    Raises
+    ------
+    StoreError
+        Where they are damaged or missing.
+    """
+    return _read_node(store, attributes(store), name)
+
+
+def _nodes(path: Path, inside: str = "") -> Iterator[str]:
+    """Yield the names of the arrays and groups inside a group, whatever their depth."""
+    for folder in sorted((path / inside).iterdir()):
+        if (about := read_json(folder / METADATA) if folder.is_dir() else {}) and not folder.name.startswith("."):
+            name = f"{inside}{folder.name}"
+            yield name
+            if about.get("node_type") == "group":
+                yield from _nodes(path, f"{name}/")
+
+
+def digest(metadata: dict[str, Any]) -> int:
+    """Return the CRC-32C of metadata, whatever their white space and the order of their names."""
+    return crc32c(json.dumps(metadata, sort_keys=True, separators=(",", ":")).encode())
+
+
+def _store_around(array: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the store that an array is part of, and what it says of itself; its folder and nothing for one alone."""
+    for folder in list(array.parents)[:2]:
+        if about := attributes(folder):
+            return folder, about
+    return array.parent, {}
+
+
+def _check_nodes(store: Path, about: Mapping[str, Any], names: Iterable[str]) -> None:
+    """Check that the metadata of arrays are those that were written."""
+    for name in names:
+        if name in about.get("arrays", ()):
+            _read_node(store, about, name)
+
+
+def _read_node(store: Path, about: Mapping[str, Any], name: str) -> dict[str, Any]:
+    file, known = store / name / METADATA, about.get("arrays", {})
+    found = read_json(file)
+    if not found:
+        raise damaged(file, "no such file", "is missing")
+    if digest(found) != known.get(name, digest(found)):
+        raise damaged(file, "its checksum is that of other data")
+    return found
+
+
+def _is_whole(about: Mapping[str, Any]) -> bool:
+    """Tell whether every chunk of a store has to be there."""
+    return format_of(about) >= FORMAT and bool(about.get("complete", True))
+
+
+_configuring = Lock()
+
+
+@contextmanager
+def _configured(how: Mapping[str, Any]) -> Iterator[None]:
+    """Let Zarr be configured so in this block, in one thread at a time: all threads have the same configuration."""
+    with _configuring, zarr.config.set(how):
+        yield
+
+
+@contextmanager
+def _opening(path: Path) -> Iterator[None]:
+    """Turn what Zarr makes of metadata that it does not understand into a StoreError."""
+    try:
+        yield
+    except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError):
+        raise
+    except OSError as error:
+        raise unreadable(path / METADATA, error) from error
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise damaged(path / METADATA, f"{type(error).__name__}: {error}") from error
 
 
 def write_aside(path: Path, data: bytes) -> None:
-    """Write a small file so that it is either whole or not there: beside its place first, then renamed."""
+    """Write a small file so that it is either whole or not there: beside its place first, synced, then renamed."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with disk_errors(path):
         aside.write_bytes(data)
-        aside.replace(path)
+        disk.place_now(aside, path)
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     """Write a small Dataset as a Zarr store, whole or not at all."""
-    words = {name: variable for name, variable in dataset.variables.items() if variable.dtype.kind == "U"}
-    dataset = dataset.assign({name: (word.dims, texts(word.to_numpy()), word.attrs) for name, word in words.items()})
     aside = path.with_name(f".{path.name}.partial")
     with disk_errors(path):
         remove(aside)
-        dataset.to_zarr(aside, mode="w", zarr_format=3, consolidated=False)
+        write_arrays(dataset, aside)
+        seal(aside)
         remove(path)
-        aside.replace(path)
+        disk.place_folder(aside, path)
+
+
+def write_arrays(dataset: xr.Dataset, path: Path) -> None:
+    """Write a small Dataset as a new Zarr group: every chunk, each with its checksum; :func:`seal` it then."""
+    words = {name: variable for name, variable in dataset.variables.items() if variable.dtype.kind == "U"}
+    dataset = dataset.assign({name: (word.dims, texts(word.to_numpy()), word.attrs) for name, word in words.items()})
+    how = {"compressors": (ZstdCodec(), Crc32cCodec()), "chunk_key_encoding": CHUNK_KEYS}
+    dataset.to_zarr(
+        path,
+        mode="w",
+        zarr_format=3,
+        consolidated=False,
+        write_empty_chunks=True,
+        encoding=dict.fromkeys(map(str, dataset.variables), how),
+    )
+
+
+def overwrite_array(path: Path, values: NDArray[Any]) -> None:
+    """Write all values of an array of a store anew."""
+    with _configured(_WRITE_ALL):
+        zarr.open_array(str(path), mode="r+", zarr_format=3)[...] = values
 
 
 def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
@@ -121,16 +286,50 @@ def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
     Raises
     ------
     MissingStoreError
-        Where there is none.
+        Where there is none, or a variable is not in it.
+    StoreError
+        Where it is damaged, or a chunk of it is missing.
     """
-    try:
-        dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
-    except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
-        raise MissingStoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
-    dataset = (dataset[list(only)] if only else dataset).load()
+    dataset = open_lazily(path, partial=False)
+    if lacking := set(only) - set(map(str, dataset.variables)):
+        raise MissingStoreError(
+            "this store is of another kind or version",
+            str(path),
+            ", ".join(only),
+            f"no {', '.join(sorted(lacking))}",
+            "Remove it, and run the stage that writes it again",
+        )
+    with reading(path):
+        dataset = (dataset[list(only)] if only else dataset).load()
     return dataset.assign(
         {name: word.astype(object) for name, word in dataset.data_vars.items() if word.dtype.kind == "T"}
     )
+
+
+def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
+    """Return the Dataset of a store, whose chunks are checked when they are read.
+
+    Parameters
+    ----------
+    partial
+        Take chunks that are missing as the fill value: those of frames that are not done.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there is none.
+    StoreError
+        Where its metadata are damaged.
+    """
+    about = attributes(path)
+    _check_nodes(path, about, about.get("arrays", ()))
+    whole = format_of(about) >= FORMAT and not partial
+    try:
+        with _configured(CHECKED if whole else {}), _opening(path):
+            opened: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
+    except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
+        raise MissingStoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
+    return opened
 
 
 def remove(path: Path) -> None:

@@ -16,11 +16,10 @@ from . import schema
 from .journal import Payload
 from .kernels.sums import add_frames, coverage
 from .movie import Movie
-from .passes import Passes, save_array
+from .passes import Passes, load_saved, save_array
 from .progress import Sink, silent
 from .provenance import stage_key
 from .shards import Shard, split
-from .stores import load_array
 
 Bools = NDArray[np.bool_]
 
@@ -67,15 +66,15 @@ def sum_image(
     per_part = -(-len(movie.shards) // SUM_PARTS)
     parts = split(movie.n_frames, max(1, movie.shards[0].frames) * per_part)
     with Passes("sum", movie, on_event, journal, client, runs=1) as stage:
-        done = stage.journal("parts", stage_key(movie.key, shift.tobytes(), used.tobytes()))
+        done = stage.journal("parts", stage_key("sum", movie.key, shift, used), {"missing": ()})
         stage.begin([(done, parts)])
         payloads = stage.run(partial(_sum_part, movie, shift, used, done.path), parts, done)
         exposure = coverage(movie.shape[1:], shift[used])
         total = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max))
         for part in parts:
-            add_frames(total, load_array(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
+            add_frames(total, load_saved(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
             if payloads[part.index]["missing"]:
-                exposure -= load_array(done.path / f"{part.index}-missing.npy")
+                exposure -= load_saved(done.path / f"{part.index}-missing.npy")
         image = np.divide(total * movie.gain, exposure, out=np.zeros(total.shape), where=exposure > 0)
         rounding = np.zeros(2) if drift is None else (drift["drift"].to_numpy() - shift)[used].mean(axis=0)
         stage.end(f"mean of {int(used.sum())} frames")

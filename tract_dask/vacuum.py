@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .errors import SettingsError
 from .kernels.filters import blur
+from .kernels.magnitude import unit_of
 from .schema import AMPLITUDE
 
 _SHARES = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8)
@@ -40,9 +41,10 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
     image = np.asarray(summed["image"].to_numpy(), dtype=np.float64)
     exposure = summed["exposure"].to_numpy()
     covered = exposure == exposure.max()
-    smooth = blur(image.astype(np.float32), sigma)
+    unit = unit_of(image)
+    smooth = blur((image if unit == 1 else image / unit).astype(np.float32), sigma)
     smooth -= smooth.mean(dtype=np.float64)
-    amplitude = float(np.nanmedian(np.abs(columns["fit_ref"].to_numpy()[:, AMPLITUDE])))
+    amplitude = float(np.nanmedian(np.abs(columns["fit_ref"].to_numpy()[:, AMPLITUDE]))) / unit
     sides = [side for share in _SHARES if (side := int(share * min(image.shape))) >= _MIN_SIDE_PX]
     step = max(1, min(sides, default=1) // _STEPS)
     sides = [side // step * step for side in sides]

@@ -16,9 +16,10 @@ import numpy as np
 import xarray as xr
 
 import tract_dask as td
-from tract_dask import results, schema, stores
+from tract_dask import parts, results, schema
+from tract_dask.journal import Journal, journal_beside
 from tract_dask.settings import FitSettings, to_toml
-from tract_dask.shards import Shard
+from tract_dask.shards import Shard, split
 from tract_dask.simulate import ceo2_table
 
 from .tables import Table
@@ -131,15 +132,19 @@ def make(path: Path) -> None:
     jumps = {int(c): np.sort(rng.integers(1, N_FRAMES, _JUMPS)) for c in range(0, len(ids), _JUMPERS)}
     steps = {c: np.cumsum(rng.normal(0.0, 2.0, (_JUMPS + 1, 2)), axis=0) for c in jumps}
     level = float(table["intensity"].sel(atoms=_ATOMS)) * _DOSE
-    for number, start in enumerate(range(0, N_FRAMES, FRAMES_PER_SHARD)):
-        shard = Shard(number, start, min(N_FRAMES, start + FRAMES_PER_SHARD))
+    journal = Journal(journal_beside(path), "scale")
+    for shard in split(N_FRAMES, FRAMES_PER_SHARD):
         values = _values(shard, columns, level, rng)
         frames = np.arange(shard.start, shard.stop)
         for c, at in jumps.items():
             values["fit"][:, c, 1:3] += steps[c][np.searchsorted(at, frames, side="right")]
         values["centroid"][:] = values["fit"][..., [2, 1]]
-        results.write(path, shard, values, FRAMES_PER_SHARD)
-    stores.update_attributes(path, complete=True)
+        with journal.batch() as done:
+            parts.write(journal.path, shard, values, FRAMES_PER_SHARD)
+            done(shard, {})
+    parts.join(path, journal)
+    results.finish(path)
+    journal.remove()
 
 
 def _columns() -> xr.Dataset:

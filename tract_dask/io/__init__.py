@@ -5,10 +5,8 @@ A format is a function from a path to a :class:`~tract_dask.io.source.Source` an
 
 from __future__ import annotations
 
-import fnmatch
 import os
 import re
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -19,14 +17,25 @@ from typing import TypeAlias
 from ..errors import SourceError
 from ..settings import MetadataSettings, SourceSettings
 from .hdf5 import open_hdf5
+from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
-from .sequence import SequenceSource, natural_key, open_sequence
+from .sequence import open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
 
-__all__ = ["READERS", "FrameSource", "Permit", "SourceMetadata", "open_cached", "open_source"]
+__all__ = [
+    "READERS",
+    "FileList",
+    "FrameSource",
+    "Permit",
+    "SourceMetadata",
+    "list_files",
+    "open_cached",
+    "open_source",
+    "unknown_format",
+]
 
 Opener: TypeAlias = Callable[[Path, str, SourceSettings], Source]
 """Takes a file, the path inside it (HDF5 only), and how to read it; makes every check."""
@@ -49,12 +58,11 @@ READERS: dict[str, Opener] = {
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
 
-_WILD = "*?["
 _VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
 
 
 def open_source(
-    path: Path | str | Sequence[Path | str],
+    path: Path | str | FileList | Sequence[Path | str],
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
     *,
@@ -68,7 +76,7 @@ def open_source(
     ----------
     path
         What to open. In a folder, all files of its one readable format; of several files, the frames in their order.
-        A path that is there is never taken for a pattern.
+        A path that is there is never taken for a pattern. A :class:`FileList` is opened as it is.
     settings
         Shape and type of raw files.
     metadata
@@ -89,13 +97,10 @@ def open_source(
     SettingsError
         Where a raw file is not, or wrongly, declared.
     """
-    names = [str(path)] if isinstance(path, str | Path) else [str(file) for file in path]
-    name = names[0] if names else "an empty list"
+    place = path if isinstance(path, FileList) else str(path) if isinstance(path, str | Path) else list(map(str, path))
+    name = next(iter(place), "an empty list") if isinstance(place, list) else str(place)
     with reading(name):
-        if isinstance(path, str | Path):
-            source: Source = _open(name, settings, permit)
-        else:
-            source = _open_list(names, settings, permit)
+        source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
     known = source.metadata
     merged = SourceMetadata(
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
@@ -108,7 +113,7 @@ def open_source(
 
 
 def open_cached(
-    path: str | Path | tuple[str | Path, ...],
+    path: str | Path | FileList | tuple[str | Path, ...],
     settings: SourceSettings = DECLARED_NOTHING,
     metadata: MetadataSettings = AS_THE_FILE_SAYS,
     *,
@@ -123,12 +128,12 @@ def open_cached(
     place = Path(_split(str(first))[0])
     status = next((at.stat() for at in (place, place.parent) if at.exists()), None)
     stamp = (status.st_size, status.st_mtime_ns) if status else None
-    return _open_stamped(path if isinstance(path, tuple) else str(path), settings, metadata, permit, stamp)
+    return _open_stamped(path if isinstance(path, tuple | FileList) else str(path), settings, metadata, permit, stamp)
 
 
 @lru_cache(maxsize=4)
 def _open_stamped(
-    path: str | tuple[str | Path, ...],
+    path: str | FileList | tuple[str | Path, ...],
     settings: SourceSettings,
     metadata: MetadataSettings,
     permit: Permit | None,
@@ -137,19 +142,15 @@ def _open_stamped(
     return open_source(path, settings, metadata, permit=permit)
 
 
-def _open(name: str, settings: SourceSettings, permit: Permit | None) -> Source:
+def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None) -> Source:
+    name = str(path)
     outer, inner = _split(name)
-    place = Path(outer)
     open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
-    if place.is_dir():
-        return open_sequence(name, _by_number(_readable(place)), open_file)
-    if _is_pattern(place):
-        return open_sequence(name, _by_number(_matching(place)), open_file)
-    _check_folder(place)
-    return open_file(place)
+    listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
+    return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
 
 
-def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> SequenceSource:
+def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> Source:
     """Open files as one movie in the order of the list; all have the same path inside."""
     split = [_split(name) for name in names]
     inside = {inner for _, inner in split}
@@ -170,52 +171,9 @@ def _split(name: str) -> tuple[str, str]:
     ends = [match.start() for match in re.finditer("::", name)]
     there = [end for end in (len(name), *reversed(ends)) if os.path.lexists(name[:end])]
     files = (end for end in there if not name[:end].endswith("/"))
-    fitting = (end for end in (*ends, len(name)) if _is_pattern(Path(name[:end])))
+    fitting = (end for end in (*ends, len(name)) if is_pattern(Path(name[:end])))
     end = next(chain(files, fitting, there), ends[0] if ends else len(name))
     return name[:end], name[end + 2 :]
-
-
-def _is_pattern(place: Path) -> bool:
-    """Tell whether a path that is not there is a pattern for the files of a folder that is."""
-    return any(sign in place.name for sign in _WILD) and not os.path.lexists(place) and place.parent.is_dir()
-
-
-def _check_folder(place: Path) -> None:
-    """Refuse a pattern for folders: only the last part of a path may be one."""
-    if any(sign in str(place.parent) for sign in _WILD) and not os.path.lexists(place.parent):
-        raise SourceError(
-            "there is no such folder",
-            str(place.parent),
-            "a folder, and a pattern for the names in it only",
-            str(place),
-            "Name the folder without * ? or [",
-        )
-
-
-def _matching(pattern: Path) -> list[Path]:
-    """Return the files whose names fit a pattern of ``*``, ``?`` or ``[]``; hidden ones where it begins with a dot."""
-    with os.scandir(pattern.parent) as found:
-        names = [item.name for item in found if fnmatch.fnmatchcase(item.name, pattern.name) and not item.is_dir()]
-    return [pattern.parent / name for name in names if name.startswith(".") <= pattern.name.startswith(".")]
-
-
-def _by_number(files: list[Path]) -> list[Path]:
-    return sorted(files, key=lambda file: natural_key(file.name))
-
-
-def _readable(folder: Path) -> list[Path]:
-    """Return the files of the one readable format in a folder."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in READERS and not file.name.startswith(".")]
-    kinds = Counter(file.suffix.lower() for file in files)
-    if len({READERS[kind] for kind in kinds}) > 1:
-        raise SourceError(
-            "the folder holds files of several formats",
-            str(folder),
-            "one format",
-            ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
-            f"Choose by a glob, for example {folder}/*{next(iter(kinds))}",
-        )
-    return files
 
 
 def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
@@ -224,15 +182,7 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Perm
     declared = settings.raw_shape is not None and settings.raw_dtype is not None
     opener = READERS.get(suffix, open_raw if declared else None)
     if opener is None:
-        raise SourceError(
-            f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
-            str(path),
-            f"a name that ends in one of {', '.join(READERS)}",
-            suffix or "a name without a suffix",
-            "Export the movie as TIFF or MRC"
-            if suffix in _VENDORS
-            else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
-        )
+        raise unknown_format(path)
     if inner and opener is not open_hdf5:
         raise SourceError(
             "only HDF5 files have paths inside",
@@ -243,3 +193,17 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Perm
         )
     with reading(str(path)):
         return open_hdf5(path, inner, settings, permit=permit) if opener is open_hdf5 else opener(path, inner, settings)
+
+
+def unknown_format(path: Path) -> SourceError:
+    """Return the error for a file that no reader opens."""
+    suffix = path.suffix.lower()
+    return SourceError(
+        f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
+        str(path),
+        f"a name that ends in one of {', '.join(READERS)}",
+        suffix or "a name without a suffix",
+        "Export the movie as TIFF or MRC"
+        if suffix in _VENDORS
+        else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
+    )

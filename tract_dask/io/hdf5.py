@@ -122,6 +122,7 @@ def open_hdf5(path: Path, inner: str, settings: SourceSettings, *, permit: Permi
             "shape": shape,
             "dtype": dtype,
             "metadata": replace(metadata, notes=metadata.notes + notes),
+            "inside": dataset.name,
         }
         if dataset.id.get_create_plist().get_external_count():
             return RawPixelSource(**common, segments=tuple(behind.raw), stored=_stored(dataset, where))

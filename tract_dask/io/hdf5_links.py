@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..errors import SourceError
+from ..errors import MissingSourceError, SourceError
 from .source import MOST_FRAMES, Permit, checked_file, reading, truncated, words
 
 MOST_LINKS = 16
@@ -370,7 +370,7 @@ def _existing(name: str, holder: Path, variable: str) -> Path | None:
 
 
 def _missing(holder: Path, inner: str, name: str, what: str) -> SourceError:
-    return SourceError(
+    return MissingSourceError(
         what,
         f"{holder}::{inner}",
         f"{name}, in the folder of {holder.name} where it has no folder of its own",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError
+from ..errors import MissingSourceError, SourceError
 from .source import Frames, Source
 
 
@@ -39,6 +39,13 @@ class SequenceSource(Source):
         """Whether frames that are read one by one take no longer than many at once."""
         return len(self.parts) == self.shape[0]
 
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included): all, where files have others."""
+        if len(self.files) != len(self.parts):
+            return slice(None)
+        first = int(np.searchsorted(self.firsts, start, side="right")) - 1
+        return slice(first, int(np.searchsorted(self.firsts, stop, side="left")))
+
     def _read(self, start: int, stop: int) -> Frames:
         frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
         number = int(np.searchsorted(self.firsts, start, side="right")) - 1
@@ -60,7 +67,7 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
         Where there are no files, one is damaged, or one differs from the first in shape or type.
     """
     if not files:
-        raise SourceError(
+        raise MissingSourceError(
             "the movie has no frames", path, "at least one file to read", "none", "Check the folder or the pattern"
         )
     first = open_file(files[0])
@@ -81,6 +88,7 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
         metadata=replace(metadata, notes=metadata.notes + gaps([file.name for file in files])),
         parts=tuple(files),
         firsts=firsts,
+        inside=first.inside,
         open_file=open_file,
     )
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError, TractError
+from ..errors import MissingSourceError, SourceError, TractError
 
 Frames: TypeAlias = NDArray[Any]
 """An array (frames, y, x)."""
@@ -83,6 +83,13 @@ class FrameSource(Protocol):
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
 
+    @property
+    def inside(self) -> str:
+        """The path of the frames inside their file; empty where the file is the movie."""
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
+
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x)."""
 
@@ -106,11 +113,16 @@ class Source:
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
     metadata: SourceMetadata
+    inside: str = ""
 
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return False
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included): all, where that is not known."""
+        return slice(None)
 
     def read(self, start: int, stop: int) -> Frames:
         """Return frames ``start`` to ``stop`` (not included) as a new array (frames, y, x).
@@ -270,7 +282,7 @@ def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
         try:
             status = path.stat()
         except (FileNotFoundError, NotADirectoryError) as error:
-            raise SourceError(
+            raise MissingSourceError(
                 f"the link leads to {path.readlink()}, which is not there"
                 if path.is_symlink()
                 else "there is no such file",

@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .magnitude import unit_of
+
 Array = npt.NDArray[Any]
 
 _REFLECTION = 10.0
@@ -60,7 +62,8 @@ def wiener(image: Array, background: float = 1.0, cutoff: float = 0.3) -> npt.ND
         raise ValueError(f"background must be at least 0, got {background}")
     if not cutoff > 0:
         raise ValueError(f"cutoff must be positive, got {cutoff}")
-    pixels = np.asarray(image, dtype=np.float32)
+    unit = unit_of(image)
+    pixels = np.asarray(image if unit == 1 else image / unit, dtype=np.float32)
     transform = np.fft.rfft2(pixels)
     power = transform.real**2 + transform.imag**2
     level = np.float32(background) * radial_background(power, image.shape)
@@ -70,7 +73,7 @@ def wiener(image: Array, background: float = 1.0, cutoff: float = 0.3) -> npt.ND
         gain = np.maximum(power - level, 0) / np.maximum(power, np.finfo(np.float32).tiny)
     gain[0, 0] = 1
     filtered = np.fft.irfft2(transform * gain * low_pass, s=image.shape)
-    return np.asarray(filtered, dtype=np.float32)
+    return np.asarray(filtered if unit == 1 else filtered * unit, dtype=np.float32)
 
 
 def radial_background(power: Array, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .. import plots, stores
 from ..analysis.jumps import change_points
 from ..errors import TractError
-from ..provenance import stage_key
+from ..provenance import digest_of
 from ..settings import RunSettings, Settings
 from ..web import STATIC, bundle
 from . import interactive
@@ -91,7 +91,7 @@ def _key(folder: Path) -> str:
     """Return the key of a report: all that the tracks say of themselves, and the settings of the run."""
     about = json.dumps(stores.attributes(folder / "results.zarr"), sort_keys=True)
     settings = folder / "run.toml"
-    return stage_key(about, settings.read_bytes() if settings.exists() else b"")
+    return digest_of(about, settings.read_bytes() if settings.exists() else b"")
 
 
 def _events(path: Path) -> list[dict[str, Any]]:
@@ -295,7 +295,7 @@ def measured(run: Survey) -> list[tuple[str, str]]:
     kinds = sorted({str(kind) for kind in run.columns["kind"].to_numpy()} - {""})
     rows = {
         "Movie": _source(run),
-        "Format": movie.get("format"),
+        "Format": movie.get("source_format"),
         "Frames": f"{shape[0]:,} of {shape[2]:,} × {shape[1]:,} px ({movie.get('dtype', 'dtype not known')})",
         "Size of a pixel": f"{known['pixel_size_pm']:g} pm" if run.unit == "pm" else "not known",
         "Field of view": f"{shape[2] * run.scale / 1000:.3g} × {shape[1] * run.scale / 1000:.3g} nm"

@@ -22,7 +22,6 @@ from .entrance.gate import Gate
 from .entrance.headers import BodyLimit, SecurityHeaders
 from .entrance.login import login
 from .feed import Feed
-from .folders import DataRoot
 from .jobs.store import JobStore
 from .metrics import CountRequests, Metrics
 from .pages import pages, static_files
@@ -66,7 +65,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         lifespan=lifespan,
     )
     config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
-    app.state.config, app.state.root = config, DataRoot(config.data_root)
+    app.state.config, app.state.root = config, config.root
     app.state.store, app.state.workshop = JobStore(config.database), Workshop()
     app.state.exports = Exports(config.state / "exports", app.state.workshop)
     app.state.feed = Feed(app.state.store)

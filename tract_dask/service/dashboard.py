@@ -1,7 +1,8 @@
 """Dask's dashboard under the service's own address: a reverse proxy for its pages, and for the sockets that feed them.
 
-Only what is read passes: no method but GET and HEAD, no cookie and no token of ours, and none of the ways through which
-a scheduler can reach other servers (its proxy to workers, Jupyter). Its pages link relative to themselves, so they work
+Only what its pages need passes: no method but GET and HEAD, no cookie and no token of ours, and no path but those named
+here. Others change things (Dask's own API), or reach other servers (its proxy to workers, Jupyter). A path is decoded
+once and tidied up before it is judged, and goes on in that form. Its pages link relative to themselves, so they work
 under any prefix; redirects are given ours.
 """
 
@@ -9,16 +10,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 from collections.abc import AsyncIterator
 from contextlib import suppress
 from http import HTTPStatus
-from urllib.parse import urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
+import httpcore  # noqa: F401  httpx would import it with its first client, while other threads import h11 and anyio
 import httpx
 import websockets
 from fastapi import APIRouter, Request, WebSocket
 from fastapi.responses import RedirectResponse, Response, StreamingResponse
 from starlette.background import BackgroundTask
+from starlette.exceptions import HTTPException
 from starlette.types import Scope
 from starlette.websockets import WebSocketDisconnect
 
@@ -57,7 +61,14 @@ _SENT_BACK = (
     "last-modified",
     "vary",
 )
-_REFUSED = ("jupyter", "proxy")
+_PAGES = (
+    *("status", "workers", "tasks", "system", "profile", "profile-server", "graph", "groups", "gpu", "hardware"),
+    *("shuffle", "stealing", "events", "counters", "exceptions"),
+)
+_PLOT = re.compile(r"individual-[a-z0-9-]+")
+_FILE = re.compile(r"[\w@+-][\w@+.-]*", re.ASCII)
+_TABLES = frozenset(("main", "worker", "task", "call-stack", "call-stacks", "logs"))
+_SOCKET = "ws"
 
 _TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 _MAX_MESSAGE_BYTES = 64 << 20
@@ -103,12 +114,14 @@ def home() -> Response:
 @dashboard.api_route(PREFIX + "/{path:path}", methods=["GET", "HEAD"])
 async def page(request: Request, path: str) -> Response:
     """Pass a page of the dashboard, or a part of one, on."""
-    address = request.app.state.runner.keeper.dashboard()
-    if address is None or not _may_pass(path):
+    address, parts = request.app.state.runner.keeper.dashboard(), canonical(request.scope)
+    if not may_pass(parts):
+        raise HTTPException(HTTPStatus.NOT_FOUND)
+    if address is None:
         return _missing(request)
     headers = {name: request.headers[name] for name in _SENT_ON if name in request.headers}
     try:
-        found = await request.app.state.upstream.get(_url(address, request.scope), request.method, headers)
+        found = await request.app.state.upstream.get(_url(address, parts, request.scope), request.method, headers)
     except httpx.HTTPError as error:
         log.info("the dashboard at %s does not answer: %s", address, error or type(error).__name__)
         return _missing(request)
@@ -122,11 +135,11 @@ async def page(request: Request, path: str) -> Response:
 @dashboard.websocket(PREFIX + "/{path:path}")
 async def socket(client: WebSocket, path: str) -> None:
     """Pass the messages of a page's socket on, both ways."""
-    address = client.app.state.runner.keeper.dashboard()
-    if address is None or not _may_pass(path):
+    address, parts = client.app.state.runner.keeper.dashboard(), canonical(client.scope)
+    if address is None or not (parts[-1:] == (_SOCKET,) and _is_page(parts[:-1])):
         await client.close(_NO_DASHBOARD)
         return
-    url = _url(address, client.scope)
+    url = _url(address, parts, client.scope)
     protocols = [websockets.Subprotocol(name) for name in client.scope["subprotocols"]]
     try:
         upstream = await websockets.connect(
@@ -184,17 +197,60 @@ async def _messages(client: WebSocket) -> AsyncIterator[str | bytes]:
         yield message["bytes"] if text is None else text
 
 
-def _may_pass(path: str) -> bool:
-    """Tell whether a path stays with the dashboard's own pages."""
-    parts = path.strip("/").split("/")
-    return parts[0] not in _REFUSED and ".." not in parts
+def canonical(scope: Scope) -> tuple[str, ...]:
+    """Return the parts of the path below the prefix: decoded once, without empty ones, "." and "..".
+
+    Examples
+    --------
+    >>> canonical({"raw_path": b"/dask/./x/%2e%2e//info/worker/tcp%3A%2F%2F127.0.0.1%3A1.html"})
+    ('info', 'worker', 'tcp://127.0.0.1:1.html')
+    """
+    raw = str(scope["raw_path"], "latin-1").partition("?")[0]
+    parts: list[str] = []
+    for part in map(unquote, raw.removeprefix(PREFIX).split("/")):
+        if part == "..":
+            parts = parts[:-1]
+        elif part not in ("", "."):
+            parts.append(part)
+    return tuple(parts)
 
 
-def _url(address: str, scope: Scope) -> str:
-    """Return where the dashboard has what is asked for; the path goes on as it came, still encoded."""
-    raw = str(scope["raw_path"], "latin-1").removeprefix(PREFIX)
+def may_pass(parts: tuple[str, ...]) -> bool:
+    """Tell whether a path is one that the dashboard's pages need."""
+    return _is_page(parts) or _is_file(parts) or _is_table(parts)
+
+
+def _is_page(parts: tuple[str, ...]) -> bool:
+    """Tell whether it is a page of plots, or the script that loads one."""
+    match parts:
+        case (name,) | (name, "autoload.js"):
+            return name in _PAGES or _PLOT.fullmatch(name) is not None
+    return False
+
+
+def _is_file(parts: tuple[str, ...]) -> bool:
+    """Tell whether it is a script, a style sheet or a picture."""
+    match parts:
+        case ("static" | "statics", _, *_):
+            return all(_FILE.fullmatch(part) for part in parts)
+    return False
+
+
+def _is_table(parts: tuple[str, ...]) -> bool:
+    """Tell whether it is a page about a worker or a task, whose names may hold anything."""
+    match parts:
+        case ("info",):
+            return True
+        case ("info", table, name):
+            return table in _TABLES and name.endswith(".html")
+    return False
+
+
+def _url(address: str, parts: tuple[str, ...], scope: Scope) -> str:
+    """Return where the dashboard has what is asked for."""
+    path = "/".join(quote(part, safe="") for part in parts)
     query = str(scope["query_string"], "latin-1")
-    return f"{address.rstrip('/')}{raw}{'?' if query else ''}{query}"
+    return f"{address.rstrip('/')}/{path}{'?' if query else ''}{query}"
 
 
 def _under_prefix(location: str, address: str) -> str:

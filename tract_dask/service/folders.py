@@ -16,15 +16,16 @@ from pathlib import Path
 
 from .. import stores
 from ..errors import DestinationError, InputError, MissingStoreError
-from ..io import READERS
+from ..io import READERS, FileList, list_files, unknown_format
+from ..io.listing import WILD
 
 STATE_FOLDER = ".tract_dask"
-"""Where the service keeps its own store, under the data root; no request reaches it."""
+"""Where earlier versions kept the service's own store, under the data root; no request reaches it."""
 
 MAX_NAME_BYTES = 255
 MAX_PATH_BYTES = 2048
 
-_INNER, _WILD = "::", "*?["
+_INNER = "::"
 
 
 class OutsideError(InputError):
@@ -55,6 +56,48 @@ class Entry:
     modified: str
 
 
+@dataclass(frozen=True)
+class Bounds:
+    """What may be opened: it is called with a path before that is opened; see :func:`tract_dask.io.open_source`.
+
+    Attributes
+    ----------
+    root
+        The data root, resolved.
+    closed
+        Folders that no request reaches, even where they are under it.
+    """
+
+    root: Path
+    closed: tuple[Path, ...] = ()
+
+    def __call__(self, path: Path) -> None:
+        """Refuse a file that does not lie under the root once all links are followed.
+
+        Raises
+        ------
+        OutsideError
+            Where it does not, or belongs to the service; or where it is a device, a pipe or a socket.
+        """
+        place = Path(os.path.realpath(path))
+        if not place.is_relative_to(self.root):
+            raise OutsideError(
+                "a link in the movie leads out of the data root",
+                path.name,
+                "files under the data root",
+                remedy="Copy that file into the data root, and link it there",
+            )
+        if self.is_closed(place):
+            raise _outside("this folder is the service's own", path.name)
+        if place.exists() and not (place.is_file() or place.is_dir()):
+            raise _outside("this is neither a file nor a folder", path.name)
+
+    def is_closed(self, place: Path) -> bool:
+        """Tell whether a resolved path is the service's own, or in a folder of its own."""
+        old = place.relative_to(self.root).parts[:1] == (STATE_FOLDER,)
+        return old or any(place.is_relative_to(folder) for folder in self.closed)
+
+
 class DataRoot:
     """The folder with the movies and the results.
 
@@ -62,6 +105,15 @@ class DataRoot:
     ----------
     root
         An existing folder; links in its own path are followed once, here.
+    closed
+        Folders that no request reaches: that of the service's own store, wherever it is.
+
+    Attributes
+    ----------
+    path
+        The folder, resolved.
+    permit
+        Refuses what is not under it; for whatever opens files.
 
     Raises
     ------
@@ -69,8 +121,9 @@ class DataRoot:
         Where it is no folder.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, closed: tuple[Path, ...] = ()) -> None:
         self.path = Path(os.path.realpath(root))
+        self.permit = Bounds(self.path, tuple(Path(os.path.realpath(folder)) for folder in closed))
         if not self.path.is_dir():
             raise DestinationError(
                 "the data root is not a folder",
@@ -102,7 +155,7 @@ class DataRoot:
         place = Path(os.path.realpath(self.path / relative))
         if not place.is_relative_to(self.path):
             raise _outside("a link leads out of the data root", relative)
-        if place.relative_to(self.path).parts[:1] == (STATE_FOLDER,):
+        if self.permit.is_closed(place):
             raise _outside("this folder is the service's own", relative)
         try:
             mode = place.stat().st_mode
@@ -119,36 +172,81 @@ class DataRoot:
             raise _outside("this is neither a file nor a folder", relative)
         return place
 
-    def source(self, relative: str) -> str:
-        """Return a movie's path for :func:`tract_dask.io.open_source`.
+    def source(self, relative: str) -> str | FileList:
+        """Return a movie for :func:`tract_dask.io.open_source`: a file, or the files of a folder or a pattern.
 
-        It is a file, ``file.h5::/path/in/file``, a folder, or a pattern for the files of one folder (``folder/*.tif``).
+        Parameters
+        ----------
+        relative
+            A file, ``file.h5::/path/in/file``, a folder, a store (.zarr), or a pattern for the files of one folder
+            (``folder/*.tif``). Only the last part may be a pattern, and what exists is none.
 
         Raises
         ------
         OutsideError, MissingStoreError
-            As :meth:`resolve`; also where a folder of single frames holds a link that leads out.
+            As :meth:`resolve`, of every file.
+        SourceError
+            Where a file is of a format that no reader opens; raw files are known by their suffix only.
         """
         outer, sign, inner = relative.partition(_INNER)
         if any(ord(letter) < 32 for letter in inner):
             raise _outside("the path inside the file has control characters", ascii(relative))
-        folder, _, name = outer.rpartition("/")
         _check_text(outer)
-        if any(letter in name for letter in _WILD) and not (self.path / outer).exists():
-            place = self.resolve(folder)
-            self._check_links(place)
-            return f"{place}/{name}{sign}{inner}"
+        folder, _, name = outer.rpartition("/")
+        if any(letter in name for letter in WILD) and not os.path.lexists(self.path / outer):
+            return self._listed(self.resolve(folder) / name, f"{sign}{inner}")
         place = self.resolve(outer)
-        if place.is_dir() and place.suffix != ".zarr":
-            self._check_links(place)
+        if place.is_file():
+            _check_format(place)
+        elif place.suffix == ".zarr":
+            self.check_links(place)
+        else:
+            return self._listed(place, f"{sign}{inner}")
+        if sign and os.path.lexists(f"{place}{sign}{inner}"):
+            raise _outside("the path inside the file is that of another file, too", relative)
         return f"{place}{sign}{inner}"
 
-    def _check_links(self, folder: Path) -> None:
-        """Refuse a folder with a link that leads out: whoever reads all that is in it would follow it."""
-        with os.scandir(folder) as found:
-            links = [item.name for item in found if item.is_symlink()]
-        for link in links:
-            self.resolve(f"{self.relative(folder)}/{link}".removeprefix("/"), must_exist=False)
+    def _listed(self, outer: Path, inner: str) -> FileList:
+        """Return the files that a folder or a pattern names; each is resolved and checked."""
+        found = list_files(f"{outer}{inner}", outer, READERS) or FileList(f"{outer}{inner}", ())
+        for file in found.files:
+            if file.is_symlink() or not file.is_file():  # any other lies where it seems to lie
+                self.permit(file)
+            _check_format(Path(os.path.realpath(file)) if file.is_symlink() else file)
+        return found
+
+    def store(self, relative: str) -> Path:
+        """Return the path of a file or a store that a job wrote, whether it is there or not.
+
+        Raises
+        ------
+        OutsideError
+            As :meth:`resolve`; also where a link in it leads out.
+        """
+        place = self.resolve(relative, must_exist=False)
+        if place.is_dir():
+            self.check_links(place)
+        return place
+
+    def check_links(self, folder: Path) -> None:
+        """Refuse a folder, such as a store, in which a link leads out, at any depth.
+
+        Raises
+        ------
+        OutsideError
+            Where one does.
+        """
+        seen, waiting = {folder}, [folder]
+        while waiting:
+            with os.scandir(waiting.pop()) as found:
+                items = list(found)
+            for item in items:
+                place = Path(os.path.realpath(item.path)) if item.is_symlink() else Path(item.path)
+                if item.is_symlink():
+                    self.permit(place)
+                if item.is_dir() and place not in seen:
+                    seen.add(place)
+                    waiting.append(place)
 
     def relative(self, path: Path) -> str:
         """Return the name, relative to the root, of a path under it.
@@ -199,6 +297,33 @@ def _kind(place: Path, is_folder: bool) -> str:
     if is_folder:
         return "movie" if stores.attributes(place).get("kind") == "movie" else "file"
     return "movie" if place.suffix.lower() in READERS else "file"
+
+
+def folded(path: str) -> tuple[str, ...]:
+    """Return the names in a path such that those are the same which some file system takes for the same.
+
+    Examples
+    --------
+    >>> folded("Jobs/ONE ") == folded("jobs/one")
+    True
+    """
+    return tuple(unicodedata.normalize("NFKC", part).casefold().rstrip(" .") for part in path.split("/") if part)
+
+
+def overlap(one: str, other: str) -> bool:
+    """Tell whether two folders, relative to the data root, are one, or one lies in the other.
+
+    Examples
+    --------
+    >>> overlap("a", "A/b"), overlap("a/b", "a"), overlap("a", "ab")
+    (True, True, False)
+    """
+    return all(mine == theirs for mine, theirs in zip(folded(one), folded(other), strict=False))
+
+
+def _check_format(place: Path) -> None:
+    if place.suffix.lower() not in READERS:
+        raise unknown_format(place)
 
 
 def _check_text(relative: str) -> None:

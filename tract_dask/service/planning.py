@@ -17,7 +17,7 @@ from starlette.datastructures import State as AppState
 
 from ..cluster import local_memory_limit, memory_limit
 from ..errors import ClusterError, SettingsError, TractError
-from ..io import open_source
+from ..io import FileList, Permit, open_source
 from ..movie import open_movie
 from ..pipeline import Outputs, Plan, check_inputs, check_output, plan_run
 from ..progress import STAGES
@@ -25,6 +25,7 @@ from ..settings import RunSettings, SourceSettings, from_dict, to_dict
 from .folders import DataRoot
 from .jobs.states import State
 from .jobs.store import JobStore
+from .outputs import Mark, check_owner
 
 BYTES_PER_S = 60e6
 """Raw bytes of a movie that a whole run gets through in a second on two cores, before any job has told better."""
@@ -91,7 +92,7 @@ def inside(root: DataRoot, settings: RunSettings) -> RunSettings:
 
 
 async def check_job(
-    state: AppState, source: str, values: dict[str, Any], output: str = ""
+    state: AppState, owner: str, source: str, values: dict[str, Any], output: str = ""
 ) -> tuple[dict[str, Any], str, Checked]:
     """Check a job; return its settings as they are stored, its folder relative to the root, and what it will take.
 
@@ -99,6 +100,8 @@ async def check_job(
     ----------
     state
         Of the application.
+    owner
+        Whose job it is.
     source, output
         Relative to the data root; ``output`` may be empty.
     values
@@ -111,15 +114,24 @@ async def check_job(
     """
     root: DataRoot = state.root
     settings = job_settings(values)
-    place = root.source(source)
-    folder = root.resolve(output, must_exist=False) if output else None
-    if folder == root.path:
-        raise SettingsError("the data root is no folder for a job", "output", remedy="Name a folder in it")
-    checked = await state.workshop.run(check_source, place, inside(root, settings), folder)
-    return stored_settings(settings), root.relative(folder) if folder else "", checked
+    place, whole = await to_thread.run_sync(_checked_paths, root, owner, source, settings, output)
+    folder = root.path / output if output else None
+    checked = await state.workshop.run(check_source, place, whole, folder, root.permit)
+    return stored_settings(settings), output, checked
 
 
-async def plan_job(state: AppState, source: str, values: dict[str, Any], output: str = "") -> dict[str, Any]:
+def _checked_paths(
+    root: DataRoot, owner: str, source: str, settings: RunSettings, output: str
+) -> tuple[str | FileList, RunSettings]:
+    """Return the movie and the settings with whole paths; all that a job names may be used."""
+    if output:
+        check_owner(root, Mark(owner, "", output))
+    return root.source(source), inside(root, settings)
+
+
+async def plan_job(
+    state: AppState, owner: str, source: str, values: dict[str, Any], output: str = ""
+) -> dict[str, Any]:
     """Return what a job would take, by name as in :class:`tract_dask.service.api.plan.PlanAnswer`.
 
     Raises
@@ -127,7 +139,7 @@ async def plan_job(state: AppState, source: str, values: dict[str, Any], output:
     TractError
         As :func:`check_job`; that it does not fit into memory or onto the disk is part of the answer.
     """
-    _, _, checked = await check_job(state, source, values, output)
+    _, _, checked = await check_job(state, owner, source, values, output)
     return await to_thread.run_sync(_measured, state, checked)
 
 
@@ -186,19 +198,19 @@ def _raw_bytes(shape: tuple[int, int, int], dtype: str) -> int:
     return math.prod(shape) * np.dtype(dtype).itemsize
 
 
-def check_source(place: str, settings: RunSettings, folder: Path | None) -> Checked:
+def check_source(place: str | FileList, settings: RunSettings, folder: Path | None, permit: Permit) -> Checked:
     """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the workshop."""
-    with closing(open_source(place, settings.source, settings.metadata)) as source:
+    with closing(open_source(place, settings.source, settings.metadata, permit=permit)) as source:
         check_inputs(source, settings)
         if folder is not None and folder.exists():
-            check_output(Outputs(folder), source, overwrite=False)
+            check_output(Outputs(folder), source, settings, overwrite=False)
         return Checked(source.shape, source.dtype.name, plan_run(source.shape, source.dtype, settings))
 
 
-def about_movie(place: str, declared: dict[str, Any]) -> dict[str, Any]:
+def about_movie(place: str | FileList, declared: dict[str, Any], permit: Permit) -> dict[str, Any]:
     """Return what a movie says about itself, ready for JSON; for a process of the workshop."""
     settings = from_dict(SourceSettings, {name: value for name, value in declared.items() if value is not None})
-    with closing(open_source(place, settings)) as source:
+    with closing(open_source(place, settings, permit=permit)) as source:
         known = source.metadata
         return {
             "format": source.format,

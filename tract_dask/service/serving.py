@@ -17,15 +17,12 @@ import uvicorn
 from .. import stores
 from ..certificates import EXPIRES_SOON_DAYS, SERVICE, SERVICE_KEY, check_certificates
 from ..errors import DestinationError, InputError
-from .config import LOOPBACK, ServiceConfig
+from .config import DATABASE, LOCK, LOOPBACK, ServiceConfig, state_folder
 from .entrance.access import Access, Role, Token
 from .entrance.headers import host_name
 from .feed import Feed
-from .folders import DataRoot
+from .folders import STATE_FOLDER, DataRoot
 from .jobs.store import JobStore
-
-LOCK = "serve.lock"
-"""Held while the process lives; the runner has a lock of its own, for whatever application it is part of."""
 
 SHUTDOWN_S = 3
 """How long requests may take to end."""
@@ -51,15 +48,14 @@ def serve(config: ServiceConfig, say: Callable[[str], None]) -> None:
     InputError
         Where others could connect and there are no tokens, or the certificates cannot be used.
     """
-    root = DataRoot(config.data_root).path
-    config = replace(config, data_root=root)
+    config = settled(config)
     prepare_state(config)
     with (
-        stores.sole_use(config.state / LOCK, _TAKEN, patience_s=1.0),
+        stores.sole_use(config.lock, _TAKEN, patience_s=1.0),  # the runner has one of its own, for any application
         closing(listen(config.host, config.port)) as listener,
     ):
         config = replace(config, port=listener.getsockname()[1])
-        notes = check_access(config) + check_traffic(config)
+        notes = check_access(config) + check_traffic(config) + check_state(config)
         from .app import create_app
 
         logging.basicConfig(format="%(asctime)s %(levelname)-7s %(message)s", level=logging.WARNING)
@@ -86,28 +82,62 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
+def settled(config: ServiceConfig) -> ServiceConfig:
+    """Return the configuration with whole paths, links followed, and the state folder that it means.
+
+    Raises
+    ------
+    DestinationError
+        Where the data root is no folder.
+    """
+    root = DataRoot(config.data_root).path
+    return replace(config, data_root=root, state_dir=Path(os.path.realpath(config.state)))
+
+
 def prepare_state(config: ServiceConfig) -> None:
     """Make the folder of what the service keeps, for its user only.
 
     Raises
     ------
     DestinationError
-        Where it cannot be written.
+        Where it, or the data root, cannot be written; or where an earlier version has left the jobs elsewhere.
     """
+    old = config.data_root / STATE_FOLDER
+    if not config.database.exists() and (old / DATABASE).is_file():
+        raise DestinationError(
+            "the jobs and tokens of this data root are in another folder",
+            str(old),
+            str(config.state),
+            remedy=f"Move it: mv {old} {config.state}; or delete it, and begin without them",
+        )
+    _check_writable(config.data_root, "the data root", "--data-root")
     try:
-        config.state.mkdir(mode=0o700, exist_ok=True)
+        config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
         config.state.chmod(0o700)
-        probe = config.state / f".probe.{os.getpid()}"
+    except OSError as error:
+        raise _not_writable(config.state, "the state folder", "--state-dir", error) from error
+    _check_writable(config.state, "the state folder", "--state-dir")
+
+
+def _check_writable(folder: Path, what: str, option: str) -> None:
+    probe = folder / f".probe.{os.getpid()}"
+    try:
         probe.touch()
         probe.unlink()
+        if folder.joinpath(LOCK).exists() and not os.access(folder / LOCK, os.W_OK):
+            raise PermissionError(errno.EACCES, f"{LOCK} is of another user's service")
     except OSError as error:
-        raise DestinationError(
-            "the data root cannot be written",
-            str(config.data_root),
-            "a folder that the service's user may write to",
-            error.strerror or str(error),
-            "Change its owner or mode, or name another with --data-root",
-        ) from error
+        raise _not_writable(folder, what, option, error) from error
+
+
+def _not_writable(folder: Path, what: str, option: str, error: OSError) -> DestinationError:
+    return DestinationError(
+        f"{what} cannot be written",
+        str(folder),
+        "a folder that the service's user may write to",
+        error.strerror or str(error),
+        f"Change its owner or mode, or name another with {option}",
+    )
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -164,7 +194,7 @@ def check_access(config: ServiceConfig) -> list[str]:
             f"--host {config.host}" if config.host not in LOOPBACK else "--tokens",
             "one token or more",
             "none",
-            f"Make one with: tract-dask token create NAME --data-root {config.data_root}",
+            f"Make one with: tract-dask token create NAME {_named(config)}",
         )
     if config.certificates is not None:
         certificate = check_certificates(config.certificates, SERVICE)
@@ -176,11 +206,25 @@ def check_access(config: ServiceConfig) -> list[str]:
 
 
 def check_traffic(config: ServiceConfig) -> list[str]:
-    """Return what the user should know about the traffic of Dask."""
+    """Return what the user should know about the traffic of Dask.
+
+    Raises
+    ------
+    InputError
+        Where tokens keep others out, and the cluster would let them in.
+    """
     cluster = config.cluster
-    address = urlsplit(cluster.scheduler or "")
-    is_near = cluster.resolved_kind == "local" or host_name(address.netloc) in LOOPBACK
-    if is_near or cluster.tls is not None:
+    if cluster.resolved_kind == "local" or cluster.tls is not None:
+        return []
+    if config.needs_tokens:
+        raise InputError(
+            "tokens would keep nobody out: whoever reaches this cluster can run code on it",
+            f"cluster of kind {cluster.resolved_kind}",
+            "a cluster with TLS",
+            "one without",
+            "Make certificates with tract-dask certs DIR, start the cluster with them, and give them with --tls DIR",
+        )
+    if host_name(urlsplit(cluster.scheduler or "").netloc) in LOOPBACK:
         return []
     return [
         "Dask's traffic is not encrypted, and whoever reaches the scheduler can run code on it: "
@@ -188,8 +232,26 @@ def check_traffic(config: ServiceConfig) -> list[str]:
     ]
 
 
-def create_token(data_root: Path, name: str, role: str, file: Path | None = None) -> str:
-    """Make a token in the store of a data root; with ``file``, write it there for its owner's eyes only.
+def check_state(config: ServiceConfig) -> list[str]:
+    """Return what the user should know about the folder of what the service keeps."""
+    old = config.data_root / STATE_FOLDER
+    if config.state.is_relative_to(config.data_root):
+        outside = state_folder(config.data_root, known=False)
+        return [
+            f"Jobs and tokens lie inside of the data root, in {config.state}. Stop the service, and move them out: "
+            f"mkdir -p {outside.parent} && mv {config.state} {outside}"
+        ]
+    return [f"{old} of an earlier version is not used any more: delete it."] if (old / DATABASE).is_file() else []
+
+
+def _named(config: ServiceConfig) -> str:
+    """Return the options of tract-dask token that name this service's store."""
+    usual = config.state == state_folder(config.data_root)
+    return f"--data-root {config.data_root}" + ("" if usual else f" --state-dir {config.state}")
+
+
+def create_token(config: ServiceConfig, name: str, role: str, file: Path | None = None) -> str:
+    """Make a token in the store of a service; with ``file``, write it there for its owner's eyes only.
 
     Raises
     ------
@@ -198,7 +260,7 @@ def create_token(data_root: Path, name: str, role: str, file: Path | None = None
     InputError
         As :meth:`tract_dask.service.entrance.access.Access.create_token`.
     """
-    access = open_access(ServiceConfig(data_root))
+    access = open_access(config)
     if file is None:
         return access.create_token(name, role)
     try:
@@ -221,24 +283,24 @@ def create_token(data_root: Path, name: str, role: str, file: Path | None = None
     return made
 
 
-def list_tokens(data_root: Path) -> list[Token]:
-    """Return all tokens of a data root."""
-    return open_access(ServiceConfig(data_root)).tokens()
+def list_tokens(config: ServiceConfig) -> list[Token]:
+    """Return all tokens of a service."""
+    return open_access(config).tokens()
 
 
-def revoke_token(data_root: Path, name: str) -> Token:
-    """Revoke a token of a data root by name or ID; see :meth:`tract_dask.service.entrance.access.Access.revoke`."""
-    return open_access(ServiceConfig(data_root)).revoke(name)
+def revoke_token(config: ServiceConfig, name: str) -> Token:
+    """Revoke a token of a service by name or ID; see :meth:`tract_dask.service.entrance.access.Access.revoke`."""
+    return open_access(config).revoke(name)
 
 
 def tokens_in_use(config: ServiceConfig) -> list[Token]:
-    """Return the tokens of a data root that are not revoked."""
+    """Return the tokens of a service that are not revoked."""
     return [token for token in open_access(config).tokens() if token.revoked is None]
 
 
 def open_access(config: ServiceConfig) -> Access:
-    """Return the tokens of a data root, whether its service runs or not."""
-    config = replace(config, data_root=DataRoot(config.data_root).path)
+    """Return the tokens of a service, whether it runs or not."""
+    config = settled(config)
     prepare_state(config)
     return Access(JobStore(config.database), config)
 

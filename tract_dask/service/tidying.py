@@ -1,62 +1,93 @@
-"""Deleting what a job wrote: nothing but its own folder, or the files of a run in a folder that somebody named."""
+"""Deleting what a job wrote: what it has left in its folder, unless it was changed since; and the folder, if empty."""
 
 from __future__ import annotations
 
-import shutil
+import os
+import re
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 
 from .. import stores
 from ..errors import TractError
-from ..pipeline import Outputs, clear_run
-from .folders import DataRoot
+from ..journal import journal_beside
+from ..pipeline import Outputs
+from .folders import DataRoot, overlap
 from .jobs.store import Job, JobStore
+from .outputs import LOCK, MARK, Mark, read_mark, signature
+
+_OF_A_STORE = re.compile(r"zarr\.json|c?[\d.]+|c(\.\d+)*|.*\.partial|.*\.jsonl")
+"""Names of the files that a run writes into its stores and journals."""
 
 
 def delete_folder(root: DataRoot, store: JobStore, job: Job) -> str:
     """Delete what a job wrote, if it is this job's alone; the job itself is forgotten already.
 
-    A folder that the job was given by its id goes as a whole. In one that was named at submission only the files of a
-    run go, and the folder if nothing else is in it.
+    Links are never followed, nor deleted: no job makes one.
 
     Returns
     -------
     str
-        Why it was kept; empty: it is gone, or was never there.
+        Why something was kept; empty: all is gone, or was never there, but for what others have put there.
     """
+    place = root.path / job.output
     try:
-        folder = root.resolve(job.output, must_exist=False)
-        if folder != root.path / job.output:
+        if Path(os.path.realpath(place)) != place:
             return "a link leads to it"
         if other := _other(store, job):
             return f"job {other} uses it, too"
-        if not folder.exists():
+        if not place.exists():
             return ""
-        if job.output == f"jobs/{job.id}":
-            shutil.rmtree(folder)
-            return ""
-        return _delete_run(root, folder, job)
+        with stores.sole_use(place / LOCK, "another run works in this folder"):
+            return _delete(place, Mark(job.owner, job.id, job.output))
     except (TractError, OSError) as error:
-        return str(error)
+        return str(error).replace(f"{root.path}/", "")
 
 
 def _other(store: JobStore, job: Job) -> str:
     """Return the id of a job whose folder is this one, in it, or around it; "" where there is none."""
-    mine = PurePosixPath(job.output)
     for row in store.connection().execute("SELECT id, output FROM jobs WHERE id != ?", (job.id,)):
-        theirs = PurePosixPath(row["output"])
-        if mine.is_relative_to(theirs) or theirs.is_relative_to(mine):
+        if overlap(row["output"], job.output):
             return str(row["id"])
     return ""
 
 
-def _delete_run(root: DataRoot, folder: Path, job: Job) -> str:
-    outputs = Outputs(folder)
-    made_of = stores.attributes(outputs.movie).get("source")
-    if made_of is not None and made_of != root.source(job.source):
-        return "it holds the run of another movie"
-    clear_run(outputs)
-    (folder / ".lock").unlink(missing_ok=True)
+def _delete(place: Path, mark: Mark) -> str:
+    """Delete what the job of a mark has left in its folder; return why something of a run was kept."""
+    found = read_mark(place)
+    if found is None and not mark.named_by_id:
+        return "no job has made it"
+    if found is not None and replace(found, made={}) != mark:
+        return f"job {found.job} has worked in it since"
+    made = found.made if found is not None else {}
+    changed = [path.name for path in _left(place) if made and made.get(path.name) != signature(path)]
+    for path in _left(place):
+        if path.name not in changed:
+            _remove(path)
+            _remove(journal_beside(path))
+    for aside in place.glob(".*.partial"):
+        _remove(aside)
+    for name in () if changed else (MARK, LOCK):
+        (place / name).unlink(missing_ok=True)
     with suppress(OSError):  # something else is in it
-        folder.rmdir()
-    return ""
+        place.rmdir()
+    return f"{', '.join(changed)} changed since the job wrote it" if changed else ""
+
+
+def _left(place: Path) -> list[Path]:
+    return [path for path in Outputs(place).written() if os.path.lexists(path)]
+
+
+def _remove(path: Path) -> None:
+    """Delete a file, or of a store or a journal what a run writes into it."""
+    if path.is_symlink():
+        return
+    if not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    for folder, _, names in os.walk(path, topdown=False):
+        for file in (Path(folder, name) for name in names if _OF_A_STORE.fullmatch(name)):
+            if not file.is_symlink():
+                file.unlink()
+        with suppress(OSError):  # something else is in it
+            Path(folder).rmdir()

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 from fastapi import Query, Request, Response
 
+from ...journal import logs
+
 Version = Annotated[
     str,
     Query(
@@ -29,7 +31,7 @@ def stamp(*paths: Path) -> str:
     """Return a text that is another once one of the files has changed, has come or has gone; a folder's files count."""
     digest = hashlib.sha256()
     for path in paths:
-        files = sorted(path.glob("*.jsonl")) if path.suffix == ".journal" else [path]
+        files = logs(path) if path.suffix == ".journal" else [path]
         for file in files:
             try:
                 status = file.stat()

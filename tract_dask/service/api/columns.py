@@ -19,10 +19,11 @@ from ...errors import MissingStoreError
 from ...settings import RunSettings, from_dict
 from ..data import curation
 from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, MOST_SITES, Scene
-from ..entrance.access import Identity, Role, identity, may_change
+from ..entrance.access import Identity, Role
 from ..jobs.states import CURATABLE, State
 from ..jobs.store import Job, JobStore
 from ..planning import inside
+from .asking import OwnJob, Who
 from .models import JobId, JobRecord, Plain, Text, errors
 from .previews import folder_of
 
@@ -238,7 +239,6 @@ def _answers(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
     return {200: {"model": model}} | errors(400, 404, 503)
 
 
-Who = Annotated[Identity, Depends(identity)]
 VersionNumber = Annotated[int, Path(ge=0, lt=HIGHEST_ID, description="0: the columns found automatically.")]
 
 
@@ -246,7 +246,8 @@ def scene_of_job(job_id: JobId, request: Request) -> Scene:
     """Return the image on which the columns of a job are edited."""
     job: Job = request.app.state.store.job(job_id)
     settings = inside(request.app.state.root, from_dict(RunSettings, job.settings))
-    return curation.scene_of(folder_of(request, job_id), settings)
+    folder = folder_of(request, job_id, "sum.zarr", "columns.zarr", "columns.csv")
+    return curation.scene_of(folder, settings)
 
 
 OfJob = Annotated[Scene, Depends(scene_of_job)]
@@ -268,10 +269,9 @@ async def read_version(job_id: JobId, version: VersionNumber, request: Request, 
 
 
 @router.post("/jobs/{job_id}/columns", status_code=201, response_model=Saved, responses=errors(400, 404, 503))
-async def save_version(job_id: JobId, new: NewVersion, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
+async def save_version(own: OwnJob, new: NewVersion, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
     """Keep columns as a new version of a job's."""
-    store, workshop = request.app.state.store, request.app.state.workshop
-    await run_in_threadpool(lambda: may_change(who, store.job(job_id)))
+    store, workshop, job_id = request.app.state.store, request.app.state.workshop, own.id
     first = await workshop.run(curation.summary, scene)
     known = await run_in_threadpool(_versions, store, job_id, first, who)
     table = await workshop.run(curation.checked_csv, scene, *_parts(new.columns), known["next_column_id"])
@@ -299,15 +299,14 @@ async def lattice_columns(job_id: JobId, lattice: Lattice, request: Request, sce
 
 
 @router.post("/jobs/{job_id}/continue", response_model=JobRecord, responses=errors(400, 404, 409))
-def continue_job(job_id: JobId, choice: Choice, request: Request, scene: OfJob, who: Who) -> Job:
+def continue_job(own: OwnJob, choice: Choice, request: Request, scene: OfJob) -> Job:
     """Let a job that waits for columns, or has ended, fit a version of them."""
     state = request.app.state
-    may_change(who, state.store.job(job_id))
     if not scene.exists:
         raise MissingStoreError(
-            "there are no columns yet", job_id, remedy="Wait until the job has found them, or try it again"
+            "there are no columns yet", own.id, remedy="Wait until the job has found them, or try it again"
         )
-    job: Job = state.store.go_on(job_id, choice.version)
+    job: Job = state.store.go_on(own.id, choice.version)
     state.runner.wake()
     return job
 

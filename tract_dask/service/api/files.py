@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
 
 from ..folders import Entry
 from ..planning import about_movie
@@ -108,5 +109,6 @@ async def about_file(
     """Read what a movie says about itself, without its pixels."""
     state = request.app.state
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
-    found: dict[str, Any] = await state.workshop.run(about_movie, state.root.source(path), declared)
+    place = await run_in_threadpool(state.root.source, path)
+    found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit)
     return found | {"path": path}

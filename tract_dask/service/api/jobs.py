@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
-from ..entrance.access import Identity, identity, may_change
 from ..jobs.states import State
 from ..jobs.store import Job, JobStore
 from ..planning import check_job
 from ..tidying import delete_folder
+from .asking import OwnJob, Who
 from .models import After, Deleted, JobDetail, JobId, JobList, JobRecord, Label, Log, LogLine, NewJob, NewLabel, errors
 
 router = APIRouter(tags=["jobs"])
-
-Who = Annotated[Identity, Depends(identity)]
 
 _LINKS = ("events", "log", "columns", "sum", "results", "report")
 
@@ -24,7 +22,7 @@ _LINKS = ("events", "log", "columns", "sum", "results", "report")
 async def submit_job(new: NewJob, request: Request, response: Response, who: Who) -> Job:
     """Queue a job, after the checks that a run makes before it starts: the movie opens, and the settings fit it."""
     state = request.app.state
-    settings, output, _ = await check_job(state, new.source, new.settings, new.output)
+    settings, output, _ = await check_job(state, who.name, new.source, new.settings, new.output)
     job: Job = state.store.submit(
         source=new.source, settings=settings, owner=who.name, label=new.label, output=output, curate=new.curate
     )
@@ -66,49 +64,43 @@ def read_job(job_id: JobId, request: Request) -> dict[str, Any]:
 
 
 @router.post("/jobs/{job_id}/cancel", response_model=JobRecord, responses=errors(404, 409))
-def cancel_job(job_id: JobId, request: Request, who: Who) -> Job:
+def cancel_job(own: OwnJob, request: Request, who: Who) -> Job:
     """Cancel a job: at once, or as soon as its process has ended; what is done is kept, and can be gone on from."""
     state = request.app.state
-    may_change(who, state.store.job(job_id))
-    job: Job = state.store.request_cancel(job_id, f"cancelled by {who.name}")
+    job: Job = state.store.request_cancel(own.id, f"cancelled by {who.name}")
     state.runner.wake()
     return job
 
 
 @router.post("/jobs/{job_id}/retry", response_model=JobRecord, responses=errors(404, 409))
-def retry_job(job_id: JobId, request: Request, who: Who) -> Job:
+def retry_job(own: OwnJob, request: Request) -> Job:
     """Queue a job again that failed, was cancelled, or could not fit some frames; it goes on from what is done."""
     state = request.app.state
-    may_change(who, state.store.job(job_id))
-    job: Job = state.store.retry(job_id)
+    job: Job = state.store.retry(own.id)
     state.runner.wake()
     return job
 
 
 @router.post("/jobs/{job_id}/label", response_model=JobRecord, responses=errors(400, 404))
-def label_job(job_id: JobId, new: NewLabel, request: Request, who: Who) -> Job:
+def label_job(own: OwnJob, new: NewLabel, request: Request) -> Job:
     """Give a job another label."""
     store: JobStore = request.app.state.store
-    may_change(who, store.job(job_id))
-    return store.label(job_id, new.label)
+    return store.label(own.id, new.label)
 
 
 @router.delete("/jobs/{job_id}", response_model=Deleted, responses=errors(404, 409))
 def delete_job(
-    job_id: JobId,
+    own: OwnJob,
     request: Request,
-    who: Who,
     files: Annotated[
         bool, Query(description="Delete what it wrote, too: only files of a run, and only its own.")
     ] = False,
 ) -> Deleted:
     """Delete a job that has ended, or waits; its files stay where they are, unless they are to go with it."""
     state = request.app.state
-    job = state.store.job(job_id)
-    may_change(who, job)
-    state.store.delete(job_id)
-    kept = delete_folder(state.root, state.store, job) if files else ""
-    return Deleted(id=job_id, files=files and not kept, kept=kept)
+    state.store.delete(own.id)
+    kept = delete_folder(state.root, state.store, own) if files else ""
+    return Deleted(id=own.id, files=files and not kept, kept=kept)
 
 
 @router.get("/jobs/{job_id}/log", response_model=Log, responses=errors(404))

@@ -284,7 +284,9 @@ class NewJob(BaseModel):
     )
     settings: SettingValues = Field(default_factory=dict, description="By group and name; the rest has its default.")
     label: Label = ""
-    output: RelativePath = Field("", description="A folder under the data root; empty: one of its own below jobs/.")
+    output: RelativePath = Field(
+        "", description="A folder under the data root, new or made by a job of yours; empty: one below jobs/."
+    )
     curate: bool = Field(
         False, strict=True, description="Stop after the summed image, for columns to be edited by hand."
     )

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Request
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..planning import plan_job
+from .asking import Who
 from .declarations import setting_rows
 from .models import RelativePath, SettingValues, Shape, errors
 
@@ -146,9 +147,9 @@ class WorkerList(BaseModel):
 
 
 @router.post("/plan", response_model=PlanAnswer, responses=errors(400, 404, 503))
-async def plan(asked: PlanRequest, request: Request) -> dict[str, Any]:
+async def plan(asked: PlanRequest, request: Request, who: Who) -> dict[str, Any]:
     """Plan a job: the checks that its submission makes, what it reads and writes, and how long it takes."""
-    return await plan_job(request.app.state, asked.source, asked.settings, asked.output)
+    return await plan_job(request.app.state, who.name, asked.source, asked.settings, asked.output)
 
 
 @router.get("/settings", response_model=SettingList, responses=errors())

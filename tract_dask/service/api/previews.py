@@ -11,6 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from ... import stores
 from ...errors import MissingStoreError
+from ...io import FileList
 from ...settings import MetadataSettings, SourceSettings, from_dict
 from ..data import pictures
 from ..data.pictures import MAX_SIDE_PX, View
@@ -113,8 +114,9 @@ async def frame_picture(
 ) -> Response:
     """Show a part of a frame of a movie on disk, in any format, also of a converted one."""
     place, version = await run_in_threadpool(_movie, request, path)
+    about = (place, raw, gain, request.app.state.root.permit)
     return await kept_answer(
-        request, "image/png", version, pictures.source_png, place, raw, gain, frame, seen, version, said=said
+        request, "image/png", version, pictures.source_png, *about, frame, seen, version, said=said
     )
 
 
@@ -128,9 +130,8 @@ async def frame_histogram(
 ) -> Response:
     """Tell what values a frame has, as frame.png shows it with the same parameters."""
     place, version = await run_in_threadpool(_movie, request, path)
-    return await kept_answer(
-        request, "application/json", version, pictures.source_levels, place, raw, gain, frame, seen, version
-    )
+    about = (place, raw, gain, request.app.state.root.permit)
+    return await kept_answer(request, "application/json", version, pictures.source_levels, *about, frame, seen, version)
 
 
 @router.get("/jobs/{job_id}/frame.png", response_class=Response, responses=_PICTURE)
@@ -138,7 +139,8 @@ async def job_frame_picture(
     job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0, said: Version = ""
 ) -> Response:
     """Show a part of a frame of a job's movie."""
-    about, version = await run_in_threadpool(_job_movie, request, job_id)
+    found, version = await run_in_threadpool(_job_movie, request, job_id)
+    about = (*found, request.app.state.root.permit)
     return await kept_answer(
         request, "image/png", version, pictures.source_png, *about, frame, seen, version, said=said
     )
@@ -147,7 +149,8 @@ async def job_frame_picture(
 @router.get("/jobs/{job_id}/histogram", response_class=Response, responses=_LEVELS)
 async def job_frame_histogram(job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0) -> Response:
     """Tell what values a frame of a job's movie has, as its frame.png shows it with the same parameters."""
-    about, version = await run_in_threadpool(_job_movie, request, job_id)
+    found, version = await run_in_threadpool(_job_movie, request, job_id)
+    about = (*found, request.app.state.root.permit)
     return await kept_answer(request, "application/json", version, pictures.source_levels, *about, frame, seen, version)
 
 
@@ -169,27 +172,43 @@ async def sum_about(job_id: JobId, request: Request, seen: Seen) -> Response:
     return await kept_answer(request, "application/json", version, pictures.sum_levels, folder, seen, version)
 
 
-def folder_of(request: Request, job_id: str) -> Path:
-    """Return the folder of a job's output."""
+def folder_of(request: Request, job_id: str, *names: str) -> Path:
+    """Return the folder of a job's output.
+
+    Parameters
+    ----------
+    names
+        What is about to be read there.
+
+    Raises
+    ------
+    OutsideError
+        Where a link in it leads out of the data root.
+    """
     state = request.app.state
-    found: Path = state.root.resolve(state.store.job(job_id).output, must_exist=False)
+    output = state.store.job(job_id).output
+    for name in names:
+        state.root.store(f"{output}/{name}")
+    found: Path = state.root.resolve(output, must_exist=False)
     return found
 
 
-def _movie(request: Request, path: str) -> tuple[str, str]:
-    place: str = request.app.state.root.source(path)
+def _movie(request: Request, path: str) -> tuple[str | FileList, str]:
+    place: str | FileList = request.app.state.root.source(path)
     return place, _version(place)
 
 
-def _version(place: str) -> str:
+def _version(place: str | FileList) -> str:
+    if isinstance(place, FileList):
+        return stamp(*sorted(place.files))
     outer = Path(place.partition("::")[0])
     return stamp(outer / "zarr.json" if outer.suffix == ".zarr" else outer)
 
 
-def _job_movie(request: Request, job_id: str) -> tuple[tuple[str, SourceSettings, MetadataSettings], str]:
+def _job_movie(request: Request, job_id: str) -> tuple[tuple[str | FileList, SourceSettings, MetadataSettings], str]:
     """Return where the movie of a job is, converted if it is already, and its version."""
     state = request.app.state
-    job, converted = state.store.job(job_id), folder_of(request, job_id) / "movie.zarr"
+    job, converted = state.store.job(job_id), folder_of(request, job_id, "movie.zarr") / "movie.zarr"
     place = str(converted) if stores.attributes(converted).get("complete") else state.root.source(job.source)
     source = from_dict(SourceSettings, job.settings.get("source", {}))
     metadata = from_dict(MetadataSettings, job.settings.get("metadata", {}))
@@ -204,7 +223,7 @@ def _sum(request: Request, job_id: str) -> tuple[Path, str]:
     MissingStoreError
         Where there is none yet.
     """
-    folder = folder_of(request, job_id)
+    folder = folder_of(request, job_id, "sum.zarr")
     about = folder / "sum.zarr" / "zarr.json"
     if not about.is_file():
         raise MissingStoreError(

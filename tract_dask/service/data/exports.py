@@ -11,7 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from ...export import export
-from ...results import SHARDED, finished_shards
+from ...parts import SHARDED
+from ...results import growing_files
 from .tracks import open_finished
 from .workshop import Workshop
 
@@ -77,21 +78,35 @@ def zipped(results: Path) -> Iterator[bytes]:
     ``zarr.storage.ZipStore`` opens it.
     """
     sink = _Sink()
-    done = finished_shards(results)
-    unfinished = {str(index) for index in range(len(done)) if not done[index]}
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
-        for path in sorted(results.rglob("*")):
-            inside = path.relative_to(results).as_posix()
-            parts = inside.split("/")
-            if any(part.startswith(".") for part in parts) or not path.is_file():
-                continue
-            if parts[0] in SHARDED and parts[1] == "c" and parts[2] in unfinished:
-                continue
-            with path.open("rb") as source, archive.open(_entry(path, inside), "w") as target:
-                while piece := source.read(_PIECE):
+        for entry, pieces in _contents(results):
+            with archive.open(entry, "w") as target:
+                for piece in pieces:
                     target.write(piece)
                     yield sink.taken()
     yield sink.taken()
+
+
+def _contents(results: Path) -> Iterator[tuple[zipfile.ZipInfo, Iterator[bytes]]]:
+    """Yield the files of a store and their bytes; of an unfinished one, those that its finished shards would make."""
+    growing = growing_files(results)
+    for path in sorted(results.rglob("*")):
+        inside = path.relative_to(results)
+        hidden = any(part.startswith(".") for part in inside.parts)
+        if (
+            path.is_file()
+            and not hidden
+            and not (growing and path.name.startswith("c.") and path.parent.name in SHARDED)
+        ):
+            yield _entry(path, inside.as_posix()), _pieces(path)
+    for path, pieces in growing or ():
+        yield _entry(results / "zarr.json", path.relative_to(results).as_posix()), pieces
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as source:
+        while piece := source.read(_PIECE):
+            yield piece
 
 
 def _entry(path: Path, inside: str) -> zipfile.ZipInfo:

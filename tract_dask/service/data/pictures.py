@@ -25,7 +25,7 @@ from scipy.sparse import csr_array
 
 from ... import stores
 from ...errors import InputError
-from ...io import open_cached
+from ...io import FileList, Permit, SourceMetadata, open_cached
 from ...movie import Movie, open_movie
 from ...settings import MetadataSettings, SourceSettings
 
@@ -107,18 +107,34 @@ class Plane:
 
 
 def source_png(
-    path: str, source: SourceSettings, metadata: MetadataSettings, frame: int, view: View, stamp: str
+    path: str | FileList,
+    source: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    frame: int,
+    view: View,
+    stamp: str,
 ) -> bytes:
     """Return a frame of a movie on disk, in any format, as PNG; ``stamp`` tells the file from what it was before."""
-    return _png(source_plane(path, source, metadata, frame, stamp), view)
+    return _png(source_plane(path, source, metadata, permit, frame, stamp), view)
 
 
 def source_levels(
-    path: str, source: SourceSettings, metadata: MetadataSettings, frame: int, view: View, stamp: str
+    path: str | FileList,
+    source: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    frame: int,
+    view: View,
+    stamp: str,
 ) -> bytes:
     """Return what values a frame has, seen like that, and the size of its pixels; see :func:`levels`."""
-    found = levels(source_plane(path, source, metadata, frame, stamp), view)
-    opened = _opened_movie(path, stamp) if path.endswith(".zarr") else open_cached(path, source, metadata).metadata
+    found = levels(source_plane(path, source, metadata, permit, frame, stamp), view)
+    opened: Movie | SourceMetadata
+    if _is_converted(path):
+        opened = _opened_movie(str(path), stamp)
+    else:
+        opened = open_cached(path, source, metadata, permit=permit).metadata
     return as_json(found | {"pixel_size_pm": opened.pixel_size_pm, "version": stamp})
 
 
@@ -135,7 +151,18 @@ def sum_levels(folder: Path, view: View, stamp: str) -> bytes:
     return as_json(found | {"pixel_size_pm": pixel_size, "version": stamp})
 
 
-def source_plane(path: str, source: SourceSettings, metadata: MetadataSettings, frame: int, stamp: str) -> Plane:
+def _is_converted(path: str | FileList) -> bool:
+    return isinstance(path, str) and path.endswith(".zarr")
+
+
+def source_plane(
+    path: str | FileList,
+    source: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    frame: int,
+    stamp: str,
+) -> Plane:
     """Return a frame of a movie on disk.
 
     Raises
@@ -143,13 +170,13 @@ def source_plane(path: str, source: SourceSettings, metadata: MetadataSettings, 
     InputError
         Where there is no such frame, or the movie cannot be opened.
     """
-    if path.endswith(".zarr"):
-        return movie_plane(_opened_movie(path, stamp), frame)
-    opened = open_cached(path, source, metadata)
+    if _is_converted(path):
+        return movie_plane(_opened_movie(str(path), stamp), frame)
+    opened = open_cached(path, source, metadata, permit=permit)
     _check_frame(frame, opened.shape[0])
 
     def read(_: int, rows: slice, columns: slice) -> Pixels:
-        return _source_frame(path, source, frame, stamp)[rows, columns]
+        return _source_frame(path, source, permit, frame, stamp)[rows, columns]
 
     return Plane(opened.shape[1:], (1,), read, opened.metadata.gain)
 
@@ -197,8 +224,10 @@ def _opened_movie(path: str, stamp: str) -> Movie:
 
 
 @lru_cache(maxsize=1)
-def _source_frame(path: str, source: SourceSettings, frame: int, stamp: str) -> Pixels:
-    pixels: Pixels = open_cached(path, source).read(frame, frame + 1)[0]
+def _source_frame(
+    path: str | FileList, source: SourceSettings, permit: Permit | None, frame: int, stamp: str
+) -> Pixels:
+    pixels: Pixels = open_cached(path, source, permit=permit).read(frame, frame + 1)[0]
     return pixels
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,8 +79,9 @@ class Tracks:
         """
         if self._series is None:
             values = np.full((len(_SERIES), stop - start), np.nan)
+            opened = results.variables(self.path)
             for first, end in _runs(self.path, self.shards, start, stop):
-                values[:, first - start : end - start] = _series(_read(self.path, first, end))[:, :, column]
+                values[:, first - start : end - start] = _series(_read(opened, first, end))[:, :, column]
         else:
             values = np.where(self.done[start:stop], self._series[column, :, start:stop], np.nan)
         return dict(zip(_SERIES, values, strict=True))
@@ -144,13 +145,13 @@ class _Copy:
     def extend(self, finished: Flags) -> None:
         """Copy the shards that are finished and not here yet."""
         by_frame, series = self._frame_map(), self._series_map()
-        drift, saved = stores.open_array(self.path / "drift"), monotonic()
+        opened, saved = results.variables(self.path), monotonic()
         for start, stop in list(_runs(self.path, finished & ~self.shards, 0, self.n_frames)):
-            part = _read(self.path, start, stop)
+            part = _read(opened, start, stop)
             values = _series(part)
             if series is not None:
                 series[:, :, start:stop] = values.transpose(2, 0, 1)
-            by_frame[:, start:stop] = _frame_numbers(part, np.asarray(drift[start:stop]))
+            by_frame[:, start:stop] = _frame_numbers(part, np.asarray(opened("drift")[start:stop]))
             self.sums = _merged(self.sums, _column_sums(values, part["status"]))
             self.shards[start // self.step : -(-stop // self.step)] = True
             if monotonic() - saved > _SAVE_S:
@@ -187,10 +188,10 @@ def _runs(path: Path, shards: Flags, start: int, stop: int) -> Iterator[tuple[in
             yield max(start, int(run[0]) * step), min(stop, (int(run[-1]) + 1) * step, fit.shape[0])
 
 
-def _read(path: Path, start: int, stop: int) -> dict[str, NDArray[Any]]:
+def _read(opened: Callable[[str], Any], start: int, stop: int) -> dict[str, NDArray[Any]]:
     """Return some frames of the variables that are needed."""
     names = ("fit", "stderr", "intensity", "intensity_stderr", "status")
-    return {name: np.asarray(stores.open_array(path / name)[start:stop]) for name in names}
+    return {name: np.asarray(opened(name)[start:stop]) for name in names}
 
 
 def _series(part: dict[str, NDArray[Any]]) -> Floats:

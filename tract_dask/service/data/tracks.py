@@ -25,7 +25,6 @@ from .track_cache import QUANTITIES, open_tracks
 Floats = NDArray[np.float64]
 
 _DIGITS = 6
-_SAMPLED = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +78,7 @@ def summary(folder: Path, cache: Path, version: str) -> bytes:
             "versions": about.get("versions", {}),
             "settings": _settings(folder, about),
             "bytes": {
-                "zarr": _stored_bytes(path, tracks.shards),
+                "zarr": results.stored_bytes(path),
                 "nc": _dataset_bytes(*sizes),
                 "csv": 470 * int(tracks.done.sum()) * sizes[1],
             },
@@ -226,7 +225,8 @@ def _only(path: Path, frames: tuple[int, ...]) -> xr.Dataset:
         Where there is no such frame.
     """
     finished = results.finished_shards(path)
-    arrays = {name: stores.open_array(path / name) for name in (*results.FITTED, "status")}
+    opened = results.variables(path)
+    arrays = {name: opened(name) for name in (*results.FITTED, "status")}
     n_frames, step = arrays["fit"].shape[0], arrays["fit"].chunks[0]
     wanted = sorted(set(frames))
     outside = [frame for frame in wanted if not 0 <= frame < n_frames]
@@ -333,19 +333,6 @@ def _settings(folder: Path, about: dict[str, Any]) -> dict[str, Any]:
         return to_dict(load(folder / "run.toml"))
     except SettingsError:
         return {"fit": to_dict(from_toml(FitSettings, about["settings"]))}
-
-
-def _stored_bytes(path: Path, done: NDArray[np.bool_]) -> int:
-    """Return about how many bytes the shards that are done take on disk: from the sizes of some of them."""
-    shards = np.flatnonzero(done)
-    some = shards[:: max(1, len(shards) // _SAMPLED)]
-    files = (
-        path.joinpath(name, "c", str(shard), *["0"] * (len(schema.RESULTS[name].dims) - 1))
-        for shard in some
-        for name in results.SHARDED
-    )
-    total = sum(file.stat().st_size for file in files if file.is_file())
-    return round(total * len(shards) / max(1, len(some)))
 
 
 def _dataset_bytes(n_frames: int, n_columns: int) -> int:

@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Sequence
 from typing import Any
 
+from ..folders import overlap
 from .clock import utc_now
 from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError
 from .states import ENDED, TRANSITIONS, State
@@ -88,10 +89,9 @@ def update(db: sqlite3.Connection, job_id: str, changes: dict[str, Any]) -> None
 
 
 def require_sole_output(db: sqlite3.Connection, output: str) -> None:
-    """Raise ConflictError where a job that has not ended writes to the folder ``output``."""
-    other = db.execute(
-        f"SELECT id FROM jobs WHERE output = ? AND state NOT IN ({marks(ENDED)})", (output, *sorted(ENDED))
-    ).fetchone()
+    """Raise ConflictError where a job that has not ended writes to the folder ``output``, in it, or around it."""
+    found = db.execute(f"SELECT id, output FROM jobs WHERE state NOT IN ({marks(ENDED)})", sorted(ENDED))
+    other = next((row for row in found if overlap(row["output"], output)), None)
     if other:
         raise ConflictError(
             "another job writes to this folder",

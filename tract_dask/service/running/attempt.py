@@ -12,18 +12,20 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from queue import Empty, Queue
 from threading import Event, Thread
 from time import monotonic
 from typing import IO, Any
 
 from ...errors import ClusterError, TractError
+from ...io import FileList
 from ...settings import ClusterSettings, to_dict
 from ..folders import DataRoot
 from ..jobs.clock import utc_now
 from ..jobs.states import State
 from ..jobs.store import Job, JobStore
+from ..outputs import Mark, check_owner, seal
 from ..planning import inside, job_settings
 from .keeper import Keeper
 
@@ -128,7 +130,7 @@ class Attempt(Thread):
         super().__init__(name=f"job {job.id}", daemon=True)
         self._job, self._store, self._root, self._keeper = job, store, root, keeper
         self._stopping, self._done = stopping, done
-        self._said = Said()
+        self._mark, self._said = Mark(job.owner, job.id, job.output), Said()
         self._asked_at: float | None = None
 
     def run(self) -> None:
@@ -165,12 +167,14 @@ class Attempt(Thread):
                 cluster = self._cluster()  # while the process imports what it needs
                 if cluster is None:
                     return self._ending(0)
-                _tell(process, json.dumps(order | {"cluster": to_dict(cluster)}))
+                where = {"cluster": to_dict(cluster), "credentials": self._keeper.credentials}
+                _tell(process, json.dumps(order | where))
                 last_lines = self._follow(process)
                 with suppress(subprocess.TimeoutExpired):  # it has said its last, and does not end
                     process.wait(GRACE_S)
             finally:
                 code = _kill(process)
+                seal(self._root, self._mark)
         if code and self._said.outcome is None and not self._is_ending():
             for line in last_lines:
                 self._store.log(self._job.id, "error", line)
@@ -178,13 +182,18 @@ class Attempt(Thread):
 
     def _order(self) -> dict[str, Any]:
         """Return the order for the process, but for the cluster; its paths are checked once more."""
-        job = self._job
+        job, place = self._job, self._root.source(self._job.source)
+        check_owner(self._root, self._mark)
         version = job.columns_version
         columns = None if version is None else self._store.columns(job.id, version) if version else ""
         return {
             "job": job.id,
-            "source": self._root.source(job.source),
-            "output": str(self._root.resolve(job.output, must_exist=False)),
+            "source": str(place),
+            "files": list(map(str, place.files)) if isinstance(place, FileList) else None,
+            "output": str(self._root.path / job.output),
+            "root": str(self._root.path),
+            "closed": list(map(str, self._root.permit.closed)),
+            "mark": asdict(self._mark),
             "settings": to_dict(inside(self._root, job_settings(job.settings))),
             "columns": columns,
             "until": "columns" if job.curate and version is None else None,

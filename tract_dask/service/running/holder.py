@@ -1,6 +1,7 @@
 """The process that holds the cluster of the service: it takes an order, and ends when its standard input does.
 
-The first line of standard input is the order: the cluster's settings, and the file that says where its scheduler is.
+The first line of standard input is the order: the cluster's settings, its credentials where they are in memory only,
+and the file that says where its scheduler is.
 It listens before it imports anything that takes time.
 """
 
@@ -50,7 +51,7 @@ def _hold(order: dict[str, Any], prepared: Event, gone: Event) -> None:
     prepared.set()
     if gone.is_set():
         return
-    with hold(settings) as cluster:
+    with hold(settings, order["credentials"]) as cluster:
         about = {"type": "Scheduler", "address": cluster.scheduler_address, "dashboard": cluster.dashboard_link}
         write_aside(file, json.dumps(about).encode())
         gone.wait()

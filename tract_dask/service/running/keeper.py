@@ -26,7 +26,7 @@ from ...cluster import scheduler_address
 from ...errors import ClusterError
 from ...settings import ClusterSettings, to_dict
 from ...supervision import Supervised
-from ...tls import checked_address, security, web_context
+from ...tls import checked_address, in_memory, security, temporary_credentials, web_context
 
 _log = logging.getLogger(__name__)
 
@@ -46,11 +46,18 @@ class Keeper:
         Of the cluster.
     folder
         Where the scheduler file is written.
+
+    Attributes
+    ----------
+    credentials
+        With which to speak to a local cluster without certificates of its own; in memory only. None for all others.
     """
 
     def __init__(self, settings: ClusterSettings, folder: Path) -> None:
         self._settings, self._file = settings, folder / "scheduler.json"
         self._is_ours = settings.resolved_kind != "address"
+        is_local = settings.resolved_kind == "local" and settings.tls is None
+        self.credentials = temporary_credentials() if is_local else None
         self._holder: Supervised | None = None
         self._looking: Thread | None = None
         self._ending = Event()
@@ -61,7 +68,11 @@ class Keeper:
         self._file.parent.mkdir(parents=True, exist_ok=True)
         self._ending.clear()
         if self._is_ours:
-            order = {"settings": to_dict(self._settings), "file": str(self._file.absolute())}
+            order = {
+                "settings": to_dict(self._settings),
+                "file": str(self._file.absolute()),
+                "credentials": self.credentials,
+            }
             forget = partial(self._file.unlink, missing_ok=True)
             self._holder = Supervised("the cluster", [sys.executable, "-m", _HOLDER], f"{json.dumps(order)}\n", forget)
         self._looking = Thread(target=self._look, name="keeper", daemon=True)
@@ -125,8 +136,7 @@ class Keeper:
         """Ask the scheduler each second; whatever goes wrong, ask again."""
         while not self._ending.is_set():
             try:
-                address = checked_address(scheduler_address(self._target()), self._settings.tls)
-                await self._look_at(address)
+                await self._look_at(scheduler_address(self._target()))
             except Exception as error:  # noqa: BLE001  not up, or gone, or not to be understood: the next one may be
                 _log.debug("the scheduler does not answer: %s", error)
             await asyncio.sleep(_LOOK_S)
@@ -137,7 +147,8 @@ class Keeper:
         return ClusterSettings(scheduler_file=str(self._file), tls=self._settings.tls)
 
     async def _look_at(self, address: str) -> None:
-        used = security(self._settings.tls)
+        used = in_memory(self.credentials) if self.credentials else security(self._settings.tls)
+        address = address if self.credentials else checked_address(address, self._settings.tls)
         arguments = used.get_connection_args("client") if used else {}
         async with rpc(address, connection_args=arguments, timeout=_ANSWER_S) as scheduler:
             dashboard: str | None = None

@@ -6,6 +6,7 @@ import json
 import threading
 import traceback
 from concurrent.futures import CancelledError
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import IO, Any
@@ -15,11 +16,15 @@ from distributed import default_client
 from distributed.comm import CommClosedError
 
 from ... import pipeline, stores
+from ...dispatch import JOB
 from ...errors import ClusterError, TractError
+from ...io import FileList
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, silent
 from ...settings import RunSettings, from_dict
-from ...tasks import JOB
 from ...terminal import clock
+from ...tls import using
+from ..folders import DataRoot
+from ..outputs import Mark, claim
 from .timeline import Timeline
 
 PROGRESS_S = 0.35
@@ -100,17 +105,25 @@ def run_order(order: dict[str, Any], on_event: Reporter) -> pipeline.RunOutcome:
     Raises
     ------
     TractError
-        As :func:`tract_dask.pipeline.run`.
+        As :func:`tract_dask.service.outputs.claim` and :func:`tract_dask.pipeline.run`.
     """
     dask.config.set({JOB: order["job"]})
     settings = from_dict(RunSettings, {**order["settings"], "cluster": order["cluster"]})
-    source, output = order["source"], Path(order["output"])
-    outputs, columns = pipeline.Outputs(output), order["columns"]
+    root, mark = DataRoot(Path(order["root"]), tuple(map(Path, order["closed"]))), Mark(**order["mark"])
+    claim(root, mark, PATIENCE_S)
+    outputs, columns = pipeline.Outputs(Path(order["output"])), order["columns"]
+    run = partial(pipeline.run, _source(order), outputs.root, settings, patience_s=PATIENCE_S, permit=root.permit)
     if columns is not None:  # an edited table is one that differs from that of a finished stage
         sink = silent if outputs.columns.exists() else on_event
-        pipeline.run(source, output, settings, on_event=sink, until="columns", patience_s=PATIENCE_S)
+        run(on_event=sink, until="columns")
         place_columns(outputs, columns)
-    return pipeline.run(source, output, settings, on_event=on_event, until=order["until"], patience_s=PATIENCE_S)
+    return run(on_event=on_event, until=order["until"])
+
+
+def _source(order: dict[str, Any]) -> str | FileList:
+    """Return the movie of an order: a path, or a list of files."""
+    files = order["files"]
+    return str(order["source"]) if files is None else FileList(order["source"], tuple(map(Path, files)))
 
 
 def place_columns(outputs: pipeline.Outputs, table: str) -> None:
@@ -138,7 +151,8 @@ def carry_out(order: dict[str, Any], stream: IO[str]) -> int:
     """Do what an order says, and say to ``stream`` how it went and ended; return the exit code of the process."""
     reporter = Reporter(stream, order["stages"])
     try:
-        outcome = run_order(order, reporter).to_record()
+        with using(order["credentials"]):
+            outcome = run_order(order, reporter).to_record()
     except KeyboardInterrupt:
         reporter.end(kind="interrupted")
         return 130

@@ -9,7 +9,6 @@ from threading import Event, Thread
 
 from ... import stores
 from ..config import ServiceConfig
-from ..folders import DataRoot
 from ..jobs.clock import utc_now
 from ..jobs.states import State
 from ..jobs.store import Job, JobStore
@@ -40,7 +39,7 @@ class Runner:
 
     def __init__(self, config: ServiceConfig, store: JobStore) -> None:
         self.keeper = Keeper(config.cluster, config.state)
-        self._config, self._store, self._root = config, store, DataRoot(config.data_root)
+        self._config, self._store, self._root = config, store, config.root
         self._attempts: dict[str, Attempt] = {}
         self._awake, self._stopping = Event(), Event()
         self._thread: Thread | None = None

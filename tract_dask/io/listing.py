@@ -1,0 +1,105 @@
+"""Which files are one movie: those of a folder, or those of a folder that a pattern names."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import SourceError
+from .sequence import natural_key
+
+WILD = "*?["
+"""Signs that make the last part of a path a pattern, unless there is a file or folder of this very name."""
+
+
+@dataclass(frozen=True)
+class FileList:
+    """Files that are one movie.
+
+    Attributes
+    ----------
+    name
+        The folder or the pattern that named them; with ``::`` and a path inside each file, where that was given. It
+        opens as the same files, unless they have changed meanwhile.
+    files
+        In the order of the numbers in their names.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def list_files(name: str, outer: Path, readers: Mapping[str, Any]) -> FileList | None:
+    """Return the files that a folder or a pattern names; None where ``outer`` is one file.
+
+    A path that exists is never a pattern, and only its last part may be one: the folder is taken as it is written.
+
+    Parameters
+    ----------
+    name
+        As the list is to be called.
+    outer
+        The folder or the pattern.
+    readers
+        Readers by suffix: of a folder the files of its one readable format are taken.
+
+    Raises
+    ------
+    SourceError
+        Where the folder of a pattern is not there, or a folder holds files of several formats.
+    """
+    if outer.is_dir():
+        found = _readable(outer, readers)
+    elif is_pattern(outer):
+        found = _matching(outer)
+    else:
+        _check_folder(outer)
+        return None
+    return FileList(name, tuple(sorted(found, key=lambda file: natural_key(file.name))))
+
+
+def is_pattern(place: Path) -> bool:
+    """Tell whether a path that is not there is a pattern for the files of a folder that is."""
+    return any(sign in place.name for sign in WILD) and not os.path.lexists(place) and place.parent.is_dir()
+
+
+def _check_folder(place: Path) -> None:
+    """Refuse a pattern for folders: only the last part of a path may be one."""
+    if any(sign in str(place.parent) for sign in WILD) and not os.path.lexists(place.parent):
+        raise SourceError(
+            "there is no such folder",
+            str(place.parent),
+            "a folder, and a pattern for the names in it only",
+            str(place),
+            "Name the folder without * ? or [",
+        )
+
+
+def _matching(pattern: Path) -> list[Path]:
+    """Return the files whose names fit a pattern of ``*``, ``?`` or ``[]``; hidden ones where it begins with a dot."""
+    with os.scandir(pattern.parent) as found:
+        names = [item.name for item in found if fnmatch.fnmatchcase(item.name, pattern.name) and not item.is_dir()]
+    return [pattern.parent / name for name in names if name.startswith(".") <= pattern.name.startswith(".")]
+
+
+def _readable(folder: Path, readers: Mapping[str, Any]) -> list[Path]:
+    """Return the files of the one readable format in a folder."""
+    files = [file for file in folder.iterdir() if file.suffix.lower() in readers and not file.name.startswith(".")]
+    kinds = Counter(file.suffix.lower() for file in files)
+    if len({readers[kind] for kind in kinds}) > 1:
+        raise SourceError(
+            "the folder holds files of several formats",
+            str(folder),
+            "one format",
+            ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
+            f"Choose by a glob, for example {folder}/*{next(iter(kinds))}",
+        )
+    return files
