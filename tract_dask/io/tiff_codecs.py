@@ -77,7 +77,7 @@ def _lerc(data: bytes) -> int:
         return 0
     version = struct.unpack_from("<i", data, 6)[0]
     rows, columns, bands = struct.unpack_from("<iii", data, 14 if version >= 3 else 10)
-    return max(0, rows) * max(0, columns) * max(1, bands if version >= 4 else 1)
+    return int(max(0, rows) * max(0, columns) * max(1, bands if version >= 4 else 1))
 
 
 def _webp(data: bytes) -> int:
