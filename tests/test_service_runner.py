@@ -465,12 +465,16 @@ def groups(dask_scheduler) -> list[str]:
     return list(dask_scheduler.task_groups)
 
 
-def test_a_process_ends_with_its_standard_input(whole, client, tmp_path):
+def test_a_process_ends_with_its_standard_input(whole, client):
     """What a killed service leaves behind ends at once, and its tasks with it."""
     order = {
         "job": "3f9a0c12de",
         "source": str(whole.root.parent / "movie.npy"),
-        "output": str(tmp_path / "out"),
+        "files": None,
+        "output": str(whole.root.parent / "cut_short"),
+        "root": str(whole.root.parent),
+        "closed": [],
+        "mark": {"owner": "ana", "job": "3f9a0c12de", "output": "cut_short"},
         "settings": SETTINGS,
         "cluster": {"scheduler": client.scheduler.address},
         "credentials": None,
