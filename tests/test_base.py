@@ -116,6 +116,11 @@ def test_a_pipe_in_the_place_of_the_record_is_not_waited_for(tmp_path):
     assert len(told) == 1
 
 
+def test_a_place_whose_name_is_not_utf8_is_refused(tmp_path):
+    with pytest.raises(DestinationError, match=r"caf\\udce9.*not UTF-8"):
+        stores.check_destination(tmp_path / os.fsdecode(b"caf\xe9") / "movie.zarr")
+
+
 def test_keys_tell_settings_apart_and_parts_from_each_other():
     key = provenance.stage_key
     assert key("fit", counted("fit", fit=FitSettings())) == key("fit", counted("fit", fit=FitSettings()))

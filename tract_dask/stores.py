@@ -344,8 +344,15 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
     Raises
     ------
     DestinationError
-        Where it holds something else, or cannot be written.
+        Where it holds something else, or cannot be written, or its name is not UTF-8, which codecs cannot open.
     """
+    if any(0xD800 <= ord(sign) < 0xE000 for sign in str(path.absolute())):
+        raise DestinationError(
+            "the name of this place is not UTF-8",
+            ascii(str(path.absolute())),
+            "letters in UTF-8",
+            remedy="Choose another place, or rename the folder",
+        )
     if path.exists() and not overwrite and not attributes(path) and not (path.is_dir() and not any(path.iterdir())):
         raise DestinationError(
             "this place holds something else",

@@ -78,7 +78,7 @@ def write_report(folder: str | Path, path: str | Path | None = None, *, figures:
     folder = Path(folder)
     place = folder / "report.html" if path is None else Path(path)
     run = survey(folder, _events(folder / "events.jsonl"))
-    stores.write_aside(place, render(run, _key(folder), figures=figures).encode())
+    stores.write_aside(place, render(run, _key(folder), figures=figures).encode(errors="backslashreplace"))
     return place
 
 

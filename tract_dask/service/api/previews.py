@@ -161,7 +161,16 @@ async def job_frame_picture(
     found, version = await run_in_threadpool(_job_movie, request, job_id)
     opened = (*found, request.app.state.root.permit)
     return await kept_answer(
-        request, "image/png", version, pictures.source_png, *opened, frame, seen, version, about=found[0], said=said
+        request,
+        "image/png",
+        version,
+        pictures.source_png,
+        *opened,
+        frame,
+        seen,
+        version,
+        about=str(found[0]),
+        said=said,
     )
 
 
@@ -171,7 +180,7 @@ async def job_frame_histogram(job_id: JobId, request: Request, seen: Seen, frame
     found, version = await run_in_threadpool(_job_movie, request, job_id)
     opened = (*found, request.app.state.root.permit)
     return await kept_answer(
-        request, "application/json", version, pictures.source_levels, *opened, frame, seen, version, about=found[0]
+        request, "application/json", version, pictures.source_levels, *opened, frame, seen, version, about=str(found[0])
     )
 
 
