@@ -60,7 +60,8 @@ def write_run(folder: Path) -> Outputs:
         path.write_text("x")
     for store in (outputs.movie, outputs.results):
         (store / "0").mkdir(parents=True, exist_ok=True)
-        (store / "zarr.json").write_text(json.dumps({"attributes": {stores.ATTRIBUTE: {"complete": True}}}))
+        about = {stores.ATTRIBUTE: {"kind": "movie", "complete": False}}
+        (store / "zarr.json").write_text(json.dumps({"attributes": about}))
         for name in ("0/zarr.json", "0/c.0.0.0"):
             (store / name).write_text("x")
     (folder / "results.zarr.journal").mkdir(exist_ok=True)

@@ -16,8 +16,8 @@ from .folders import DataRoot, overlap
 from .jobs.store import Job, JobStore
 from .outputs import LOCK, MARK, Mark, read_mark, signature
 
-_OF_A_STORE = re.compile(r"zarr\.json|c?[\d.]+|c(\.\d+)*|.*\.partial|.*\.jsonl")
-"""Names of the files that a run writes into its stores and journals."""
+_OF_A_STORE = re.compile(r"zarr\.json|c?[\d.]+|c(\.\d+)*|.*\.partial")
+"""Names of the files that a run writes into its stores."""
 
 
 def delete_folder(root: DataRoot, store: JobStore, job: Job) -> str:
@@ -39,7 +39,10 @@ def delete_folder(root: DataRoot, store: JobStore, job: Job) -> str:
         if not place.exists():
             return ""
         with sole_use(place / LOCK, "another run works in this folder"):
-            return _delete(place, Mark(job.owner, job.id, job.output))
+            kept = _delete(place, Mark(job.owner, job.id, job.output))
+        with suppress(OSError):  # something else is in it
+            place.rmdir()
+        return kept
     except (TractError, OSError) as error:
         return str(error).replace(f"{root.path}/", "")
 
@@ -64,13 +67,11 @@ def _delete(place: Path, mark: Mark) -> str:
     for path in _left(place):
         if path.name not in changed:
             _remove(path)
-            _remove(journal_beside(path))
-    for aside in place.glob(".*.partial"):
-        _remove(aside)
+            _clear(journal_beside(path))
+    for aside in (*place.glob(".*.partial"), *place.glob(".*.removed")):
+        _clear(aside)
     for file in () if changed else (place / MARK, *lock_files(place / LOCK)):
         file.unlink(missing_ok=True)
-    with suppress(OSError):  # something else is in it
-        place.rmdir()
     return f"{', '.join(changed)} changed since the job wrote it" if changed else ""
 
 
@@ -78,8 +79,14 @@ def _left(place: Path) -> list[Path]:
     return [path for path in Outputs(place).written() if os.path.lexists(path)]
 
 
+def _clear(path: Path) -> None:
+    """Delete a journal, or what was written aside, as a whole: nobody else puts anything there."""
+    if not path.is_symlink():
+        stores.remove(path)
+
+
 def _remove(path: Path) -> None:
-    """Delete a file, or of a store or a journal what a run writes into it."""
+    """Delete a file, or of a store what a run writes into it."""
     if path.is_symlink():
         return
     if not path.is_dir():
