@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from .. import stores
 from ..errors import TractError
 from ..journal import journal_beside
 from ..locks import lock_files, sole_use
