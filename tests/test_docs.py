@@ -175,6 +175,11 @@ def test_every_script_is_run_by_the_checks():
         assert any(re.search(rf"\b{script.name}\b", text) for text in texts), script.name
 
 
+def test_no_document_has_marks_of_a_merge():
+    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        assert not re.search(r"^(<{7}|\|{7}|={7}|>{7})", document.read_text(encoding="utf-8"), re.MULTILINE), document
+
+
 def test_changelog_has_a_place_for_what_is_new():
     assert "## [Unreleased]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 

@@ -21,6 +21,7 @@ from tract_dask.movie import open_movie
 from tract_dask.progress import STAGES, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, RunSettings, SourceSettings
 from tract_dask.stamps import Stamps
+from tract_dask.verify import repair, verify
 
 SMALL = ConvertSettings(shard_mb=1)
 FRAMES = np.arange(24, dtype=np.uint16)[:, None, None] + np.full((24, 96, 80), 100, np.uint16)
@@ -149,6 +150,34 @@ def test_a_file_of_a_sequence_that_is_replaced_is_refused(tmp_path, number):
     with pytest.raises(ChangedSourceError) as caught:
         convert(folder, tmp_path / "m.zarr", settings=SMALL, on_event=after(3, lambda: replace(changed, other)))
     assert caught.value.where == str(changed)
+
+
+def test_a_list_of_files_is_converted_and_repaired_in_its_order(tmp_path):
+    order = [2, 0, 3, 1]
+    for number in order:
+        np.save(tmp_path / f"frame_{number}.npy", FRAMES[number])
+    listed = open_source([tmp_path / f"frame_{number}.npy" for number in order])
+    movie = convert(listed, tmp_path / "movie.zarr", settings=SMALL)
+    assert convert(listed, movie, settings=SMALL) == movie
+    np.testing.assert_array_equal(open_movie(movie).read(0, 4), FRAMES[order])
+    next((movie / "0").glob("c.*")).unlink()
+    repair(verify(movie))
+    assert verify(movie).sound
+    np.testing.assert_array_equal(open_movie(movie).read(0, 4), FRAMES[order])
+
+
+@pytest.mark.parametrize("pattern", ["", "frame_*.npy"])
+def test_the_shards_of_a_sequence_are_made_anew(tmp_path, pattern):
+    place = tmp_path / "frames [1]"
+    place.mkdir()
+    for number in range(4):
+        np.save(place / f"frame_{number}.npy", FRAMES[number])
+    movie = convert(place / pattern, tmp_path / "movie.zarr", settings=SMALL)
+    next((movie / "0").glob("c.*")).unlink()
+    repair(verify(movie))
+    assert verify(movie).sound
+    np.testing.assert_array_equal(open_movie(movie).read(0, 4), FRAMES[:4])
+    assert not list(tmp_path.glob(".movie*"))
 
 
 def test_a_shard_asks_about_its_own_files_only(tmp_path, monkeypatch):

@@ -124,7 +124,7 @@ def convert(
         for name, values in statistics.items():
             values[shard.start : shard.stop] = payload[name]
 
-    job = _Job(_absolute(movie.path), source_settings, path, journal.path, layout, settings.codec, origin.stamps)
+    job = _Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps)
     with _unchanged(path, movie, origin):
         stream_shards(
             partial(_convert_shard, job),
@@ -161,7 +161,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     about = stores.attributes(path)
     settings = from_toml(ConvertSettings, about["settings"], str(path))
     declared = from_toml(SourceSettings, about["source_settings"], str(path))
-    source = open_source(about["source"], declared)
+    source = open_source(about.get("source_files") or about["source"], declared)
     if movie_key(source, settings, declared) != about["key"]:
         raise SourceError(
             "the source is not what the movie was made from",
@@ -176,7 +176,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     stores.remove(aside)
     aside.mkdir()
     stamps = origin_of(source).stamps
-    job = _Job(_absolute(source.path), declared, path, aside, layout, settings.codec, stamps)
+    job = _Job(_place(source), declared, path, aside, layout, settings.codec, stamps)
     frame_bytes = math.prod(layout.shape[1:]) * layout.dtype.itemsize
     on_event(StageStarted(STAGE, sum(shard.frames for shard in chosen), frame_bytes=frame_bytes))
     started = time.perf_counter()
@@ -386,7 +386,12 @@ def _remembered(source: FrameSource) -> dict[str, Any]:
     """Return what a movie remembers of a source that is there."""
     if isinstance(source, GoneSource):
         return {}
-    return {"source": _absolute(source.path), "source_format": source.format, "file_says": _quantities(source.metadata)}
+    return {
+        "source": _absolute(source.path),
+        "source_files": list(map(_absolute, source.listed)),
+        "source_format": source.format,
+        "file_says": _quantities(source.metadata),
+    }
 
 
 def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
@@ -450,7 +455,7 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
 class _Job:
     """What every task of a conversion needs: paths and plans, no data."""
 
-    source: str
+    source: str | tuple[str, ...]
     source_settings: SourceSettings
     path: Path
     aside: Path
@@ -460,7 +465,7 @@ class _Job:
 
 
 @lru_cache(maxsize=4)
-def _opened(source: str, settings: SourceSettings, stamps: str) -> FrameSource:
+def _opened(source: str | tuple[str, ...], settings: SourceSettings, stamps: str) -> FrameSource:
     """Open the source once in a process; ``stamps`` tells it from another one later at the same place."""
     return open_source(source, settings)
 
@@ -474,7 +479,7 @@ def _convert_shard(job: _Job, shard: Shard) -> Payload:
     if found != expected:
         raise SourceError(
             "the movie is not what it was when the conversion began",
-            job.source,
+            source.path,
             expected,
             found,
             "Do not change the file meanwhile; convert it again",
@@ -641,6 +646,11 @@ def _overridden(found: SourceMetadata, metadata: MetadataSettings) -> SourceMeta
 
 def _quantities(metadata: SourceMetadata | MetadataSettings) -> dict[str, Any]:
     return {name: getattr(metadata, name) for name in schema.CALIBRATION}
+
+
+def _place(source: FrameSource) -> str | tuple[str, ...]:
+    """Return what a task opens to have the same movie: one name, or those of a list."""
+    return tuple(map(_absolute, source.listed)) or _absolute(source.path)
 
 
 def _absolute(source: str) -> str:

@@ -109,7 +109,8 @@ def open_source(
         gain=metadata.gain,
         notes=known.notes,
     )
-    return replace(source, path=name, metadata=merged)
+    listed = tuple(place) if isinstance(place, list) else ()
+    return replace(source, path=name, metadata=merged, listed=listed)
 
 
 def open_cached(

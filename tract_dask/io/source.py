@@ -87,6 +87,10 @@ class FrameSource(Protocol):
     def inside(self) -> str:
         """The path of the frames inside their file; empty where the file is the movie."""
 
+    @property
+    def listed(self) -> tuple[str, ...]:
+        """The names of the list that the movie was opened by, of which ``path`` is the first; empty for one name."""
+
     def files_of(self, start: int, stop: int) -> slice:
         """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
 
@@ -114,6 +118,7 @@ class Source:
     dtype: np.dtype[Any]
     metadata: SourceMetadata
     inside: str = ""
+    listed: tuple[str, ...] = ()
 
     @property
     def one_by_one(self) -> bool:
