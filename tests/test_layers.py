@@ -40,7 +40,7 @@ ALLOWED = {
     "io": STORES,
     "shard_files": {"disk"},
     "layout": {"settings", "kernels", "shard_files"},
-    "ome": {"schema", "stores"},
+    "ome": {"damage", "schema", "stores"},
     "movie": STORES | {"kernels", "ome", "shard_files"},
     "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files", "tasks"},
     "passes": STORES | {"movie", "shard_files", "tasks"},
@@ -88,7 +88,7 @@ ALLOWED = {
     "certificates": {"errors"},
     "service": RUN
     | {"parts", "analysis", "certificates", "describe", "export", "forkserver", "lazy", "locks"}
-    | {"meter", "report", "shard_files", "supervision", "terminal", "web"},
+    | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},

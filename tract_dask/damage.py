@@ -90,7 +90,7 @@ def store_of(file: Path) -> Path:
 def frames_in(file: Path) -> tuple[int, int] | None:
     """Return the first frame of a chunk's file and the one behind its last; None where it has no frames."""
     try:
-        about = json.loads((file.parent / METADATA).read_bytes())
+        about = json.loads(read_small(file.parent / METADATA, _METADATA_BYTES))
         number = int(file.name.split(".")[1])
         step, length = about["chunk_grid"]["configuration"]["chunk_shape"][0], about["shape"][0]
         in_frames = about["dimension_names"][0] in FRAME_AXES

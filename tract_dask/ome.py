@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import zarr
 
 from . import schema, stores
+from .damage import METADATA, read_json
 
 AXES = ("t", "y", "x")
 
@@ -24,7 +24,7 @@ def describe(path: Path, ours: dict[str, Any]) -> None:
     ):
         stores.overwrite_array(path / axis, np.arange(length) * (step or 1.0))
         zarr.open_array(str(path / axis), mode="r+").attrs["units"] = units[0] if step else units[1]
-    root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    root = read_json(path / METADATA)
     root["attributes"] = {
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),
         stores.ATTRIBUTE: ours,
@@ -42,7 +42,7 @@ def _nodes(path: Path) -> dict[str, Any]:
         "binned",
         *(f"binned/{file.name}" for file in (path / "binned").glob("[0-9]*")),
     )
-    return {name: json.loads((path / name / "zarr.json").read_text(encoding="utf-8")) for name in names}
+    return {name: read_json(path / name / METADATA) for name in names}
 
 
 def _ome_metadata(name: str, bins: tuple[int, ...], pixel: float | None, frame_time: float | None) -> dict[str, Any]:

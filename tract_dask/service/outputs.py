@@ -22,6 +22,7 @@ from ..errors import DestinationError
 from ..io.listing import WILD
 from ..locks import sole_use
 from ..pipeline import Outputs
+from ..small_files import read_small
 from .folders import DataRoot, OutsideError, folded
 from .refusals import ForbiddenError
 
@@ -33,6 +34,7 @@ JOBS = "jobs"
 """The folder of the outputs that jobs do not name themselves."""
 
 _TRIES = 5
+_MARK_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class Mark:
 def read_mark(folder: Path) -> Mark | None:
     """Return the mark of a folder; None where it has none, or one that cannot be read."""
     try:
-        return Mark(**json.loads((folder / MARK).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        return Mark(**json.loads(read_small(folder / MARK, _MARK_BYTES)))
+    except (OSError, ValueError, TypeError, RecursionError):
         return None
 
 
