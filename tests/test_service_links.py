@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from serviced import FRAMES, make_app, make_root
 
 from tract_dask.conversion import convert
-from tract_dask.errors import TractError
+from tract_dask.errors import MissingSourceError, TractError
 from tract_dask.io import FileList
 from tract_dask.service.folders import Bounds, DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
@@ -255,6 +255,22 @@ def test_a_job_fails_whose_source_came_to_lead_out(api, root):
     attempt = Attempt(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)
     with pytest.raises(TractError, match="data root"):
         attempt._order()
+
+
+@pytest.mark.parametrize("source", ["sub/other.npy", "frames", "frames/f_*.npy"])
+def test_a_source_that_was_archived_is_the_runs_to_judge(api, root, source):
+    """A job that waited for its columns goes on with the movie that it has converted."""
+    (root / "frames").mkdir()
+    np.save(root / "frames" / "f_1.npy", np.zeros(FRAMES, np.uint8))
+    job = api.post("jobs", json={"source": source}).json()
+    (root / source.split("/")[0]).rename(root / "archive")
+    state = api.app.state
+    state.store.change(job["id"], State.RUNNING)
+    order = Attempt(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)._order()
+    assert order["source"] == str(root / source)
+    cluster = to_dict(RunSettings())["cluster"]
+    with pytest.raises(MissingSourceError):
+        run_order(order | {"cluster": cluster}, Reporter(io.StringIO(), {}))
 
 
 def test_bounds_are_equal_where_they_mean_the_same(tmp_path):

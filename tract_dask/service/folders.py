@@ -189,7 +189,7 @@ class DataRoot:
             raise _outside("this is neither a file nor a folder", relative)
         return place
 
-    def source(self, relative: str) -> str | FileList:
+    def source(self, relative: str, *, must_exist: bool = True) -> str | FileList:
         """Return a movie for :func:`tract_dask.io.open_source`: a file, or the files of a folder or a pattern.
 
         Parameters
@@ -197,6 +197,8 @@ class DataRoot:
         relative
             A file, ``file.h5::/path/in/file``, a folder, a store (.zarr), or a pattern for the files of one folder
             (``folder/*.tif``). Only the last part may be a pattern, and what exists is none.
+        must_exist
+            Whether it has to be there; the source of a movie that is converted need not.
 
         Raises
         ------
@@ -211,8 +213,10 @@ class DataRoot:
         _check_text(outer)
         folder, _, name = outer.rpartition("/")
         if any(letter in name for letter in WILD) and not os.path.lexists(self.path / outer):
-            return self._listed(self.resolve(folder) / name, f"{sign}{inner}")
-        place = self.resolve(outer)
+            return self._listed(self.resolve(folder, must_exist=must_exist) / name, f"{sign}{inner}")
+        place = self.resolve(outer, must_exist=must_exist)
+        if not place.exists():
+            return f"{place}{sign}{inner}"
         if place.is_file():
             _check_format(place)
         elif place.suffix == ".zarr":
@@ -342,11 +346,14 @@ def _cursor(key: _Key) -> str:
 
 
 def _cursor_key(cursor: str) -> _Key:
+    kind, code = cursor[:1], cursor[1:]
     try:
-        name = os.fsdecode(bytes.fromhex(cursor[1:]))
-    except ValueError as error:
-        raise InputError("there is no such page", "after", "what the page before gave as next", cursor[:40]) from error
-    return cursor[0] != "0", name.lower(), name
+        name = os.fsdecode(bytes.fromhex(code))
+    except ValueError:
+        name = ""
+    if kind not in ("0", "1") or not name:
+        raise InputError("there is no such page", "after", "what the page before gave as next", cursor[:40])
+    return kind == "1", name.lower(), name
 
 
 def _is_text(name: str) -> bool:

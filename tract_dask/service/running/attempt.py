@@ -184,8 +184,11 @@ class Attempt(Thread):
         return self._ending(code)
 
     def _order(self) -> dict[str, Any]:
-        """Return the order for the process, but for the cluster; its paths are checked once more."""
-        job, place = self._job, self._root.source(self._job.source)
+        """Return the order for the process, but for the cluster; its paths are checked once more.
+
+        A movie that is not there is the run's to judge: it may be converted already.
+        """
+        job, place = self._job, self._root.source(self._job.source, must_exist=False)
         check_owner(self._root, self._mark)
         version = job.columns_version
         columns = None if version is None else self._store.columns(job.id, version) if version else ""
