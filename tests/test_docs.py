@@ -29,14 +29,19 @@ def blocks(document: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
 
 
-def call(*command: str, folder: Path, timeout: int = 300) -> str:
+def call(*command: str, folder: Path, timeout: int = 300, **environment: str) -> str:
     """Run a command in a process group of its own, which ends with it; return what it printed."""
     with (
         tempfile.TemporaryFile("w+") as out,
         tempfile.TemporaryFile("w+") as err,
     ):  # a pipe would wait for background jobs
         process = subprocess.Popen(
-            command, cwd=folder, env=os.environ | {"PATH": PATH}, stdout=out, stderr=err, start_new_session=True
+            command,
+            cwd=folder,
+            env=os.environ | {"PATH": PATH} | environment,
+            stdout=out,
+            stderr=err,
+            start_new_session=True,
         )
         try:
             code = process.wait(timeout)
@@ -52,13 +57,19 @@ def call(*command: str, folder: Path, timeout: int = 300) -> str:
 
 @contextlib.contextmanager
 def served(block: str, folder: Path):
-    """A service that a reader starts in one terminal, while the next commands run in another."""
+    """A service that a reader starts in one terminal, on a free port, while the next commands run in another."""
     process = subprocess.Popen(
-        ["bash", "-c", f"exec {block}"], cwd=folder, env=os.environ | {"PATH": PATH}, stdout=subprocess.PIPE, text=True
+        ["bash", "-c", f"exec {block.strip()} --port 0"],
+        cwd=folder,
+        env=os.environ | {"PATH": PATH},
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
-        assert any("http://127.0.0.1:8000" in line for line in process.stdout), "it did not start"
-        yield
+        found = (re.search(r"http://127\.0\.0\.1:\d+", line) for line in process.stdout)
+        address = next((match[0] for match in found if match), "")
+        assert address, "it did not start"
+        yield address
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
@@ -97,13 +108,14 @@ def test_commands_and_examples_of_the_readme(folder):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     commands = blocks("README.md", "bash")
     assert commands
+    environment = {}
     with contextlib.ExitStack() as services:
         for block in commands:
             assert RUN_BY not in block
             if block.startswith("tract-dask serve"):
-                services.enter_context(served(block, folder))
+                environment["TRACT_DASK_SERVER"] = services.enter_context(served(block, folder))
             else:
-                call("bash", "-euo", "pipefail", "-c", block, folder=folder)
+                call("bash", "-euo", "pipefail", "-c", block, folder=folder, **environment)
     assert list(folder.glob("jobs/*/results.zarr")), "what was submitted to the service"
     assert (folder / "demo_output" / "movie.tif").exists()
     for name in re.findall(r"^\| (`.*?`) \|", text, flags=re.MULTILINE):

@@ -149,5 +149,5 @@ def test_while_workers_fit_and_twice_where_they_hang(movie, tmp_path):
         played.ctrl_c()
         code, seconds = played.end()
         check(played, code)
-        assert seconds < 4.0
+        assert seconds < 10.0, "the first one alone waits for them"
         assert not psutil.wait_procs(started, timeout=20)[1]
