@@ -271,7 +271,7 @@ def test_a_store_too_large_to_be_copied_is_read_itself(service, tmp_path, monkey
 def test_a_copy_is_made_anew_where_it_was_deleted(service, tmp_path):
     service.fits.finish()
     before = get(service, "/series/1")
-    folder = tmp_path / ".tract_dask" / "tracks"
+    folder = service.app.state.config.state / "tracks"
     (place,) = folder.iterdir()
     (place / "series.f8").unlink()
     (place / "frames.f8").unlink()

@@ -288,10 +288,10 @@ class _Viewers:
 class _Here:
     """Does in a thread what the service gives to its workshop."""
 
-    async def run(self, function: Callable[..., T], *args: Any) -> T:
+    async def run(self, function: Callable[..., T], *args: Any, **limits: Any) -> T:
         return await asyncio.to_thread(function, *args)
 
-    async def run_kept(self, key: str, function: Callable[..., T], *args: Any) -> T:
+    async def run_kept(self, key: str, function: Callable[..., T], *args: Any, **limits: Any) -> T:
         return await asyncio.to_thread(function, *args)
 
 

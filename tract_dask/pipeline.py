@@ -276,7 +276,7 @@ def run(
         check_output(outputs, opened, settings, overwrite=overwrite)
         with sole_run(outputs, patience_s):
             if overwrite:
-                clear_run(outputs, on_event, keep_edited=is_movie_of(outputs.movie, opened))
+                clear_run(outputs, on_event, keep_edited=_keeps_columns(outputs, opened))
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -632,6 +632,14 @@ def check_output(
     if not overwrite:
         _check_movie(outputs, source, settings)
     stores.check_destination(outputs.movie, overwrite=overwrite)
+
+
+def _keeps_columns(outputs: Outputs, source: FrameSource) -> bool:
+    """Tell whether edited columns outlive a run with --overwrite: where the movie is known to be the same."""
+    try:
+        return is_movie_of(outputs.movie, source)
+    except StoreError:
+        return False
 
 
 def _check_movie(outputs: Outputs, source: FrameSource, settings: RunSettings | None) -> None:
