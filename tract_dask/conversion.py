@@ -636,13 +636,9 @@ def _is_zarr(folder: Path) -> bool:
 
 
 def _clear(path: Path) -> None:
-    """Remove a store and its journal; renamed first, so that what is at ``path`` is always whole."""
+    """Remove a store and its journal."""
     remove_journal(journal_beside(path))
-    aside = path.with_name(f".{path.name}.removed")
-    stores.remove(aside)
-    if path.exists():
-        path.replace(aside)
-    stores.remove(aside)
+    stores.remove(path)
 
 
 def _size(path: Path) -> int:

@@ -57,12 +57,8 @@ def journal_beside(path: Path) -> Path:
 
 
 def remove_journal(folder: Path) -> None:
-    """Delete a journal, at once for all tasks that still write to it: renamed, then deleted."""
-    aside = folder.with_name(f".{folder.name}.removed")
-    remove(aside)
-    with suppress(FileNotFoundError):
-        folder.replace(aside)
-    remove(aside)
+    """Delete a journal, at once for all tasks that still write to it."""
+    remove(folder)
 
 
 def left_over(place: Path, expected: str, got: str) -> StoreError:
