@@ -410,3 +410,38 @@ def test_verify_reads_the_parts_of_a_fit_that_is_not_finished(copy):
 def test_verify_says_where_there_is_nothing(tmp_path):
     with pytest.raises(MissingStoreError, match="no store here"):
         verify(tmp_path)
+
+
+def test_a_store_that_was_being_removed_is_gone(tmp_path, monkeypatch):
+    """A process that is killed while it deletes a store leaves none behind that looks damaged."""
+    store = tmp_path / "movie.zarr"
+    for name in (".", "frame_bad_pixels"):
+        (store / name).mkdir(parents=True, exist_ok=True)
+        (store / name / "zarr.json").write_text("{}")
+
+    def killed(folder):
+        (folder / "zarr.json").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stores.shutil, "rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            stores.remove(store)
+    assert stores.attributes(store) == {}
+    stores.remove(store)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_store_that_comes_between_two_looks_is_not_damaged(tmp_path, monkeypatch):
+    aside, store = tmp_path / "aside", tmp_path / "sum.zarr"
+    stores.write_dataset(xr.Dataset({"exposure": ("x", np.ones(3))}, attrs={stores.ATTRIBUTE: {"key": "k"}}), aside)
+    look = stores.read_json
+
+    def read_json(file):
+        found = look(file)
+        if aside.exists():
+            aside.rename(store)
+        return found
+
+    monkeypatch.setattr(stores, "read_json", read_json)
+    assert stores.attributes(store)["key"] == "k"

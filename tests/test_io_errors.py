@@ -280,7 +280,7 @@ def test_sequences_with_a_stranger(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"frame_3\.npy: the header"):
         open_source(tmp_path / "frame_*.npy")
     tifffile.imwrite(tmp_path / "sum.tif", movie()[0])
-    fails(tmp_path, "several formats", "4 .npy, 1 .tif", "glob")
+    fails(tmp_path, "several formats", "4 .npy, 1 .tif", "pattern")
 
 
 def test_tifffile_says_nothing(

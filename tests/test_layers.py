@@ -87,7 +87,7 @@ ALLOWED = {
     "program": {"cli", "interrupts"},
     "certificates": {"errors"},
     "service": RUN
-    | {"parts", "analysis", "certificates", "describe", "export", "forkserver", "lazy", "locks"}
+    | {"parts", "analysis", "certificates", "deaths", "describe", "export", "forkserver", "lazy", "locks"}
     | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},

@@ -107,7 +107,7 @@ def test_a_field_that_tiles_divide_is_not_padded():
 # Lossless conversion
 
 
-@pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "f4", "f8"])
+@pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "f4", "f8"])  # f2 is widened: tests/test_io_types.py
 @pytest.mark.parametrize("codec", ["lz4", "none"])
 def test_the_store_equals_the_source_bit_for_bit(tmp_path, dtype, codec):
     frames = pixels((19, 141, 83), dtype)

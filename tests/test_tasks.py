@@ -92,7 +92,7 @@ def test_thousands_of_small_shards_each_run_once(cluster, tmp_path):
 
 
 def test_a_batch_ends_when_its_time_is_up(tmp_path, monkeypatch):
-    monkeypatch.setattr(tasks, "_BATCH_S", 0.3)
+    monkeypatch.setattr(tasks, "BATCH_S", 0.3)
     journal = Journal(tmp_path / "journal", "key")
     payloads, seconds = tasks._work(wait_long, split(100, 1), journal, np.arange(4, 90))
     assert sorted(journal.done()) == list(range(4, 4 + len(payloads)))

@@ -92,7 +92,6 @@ def convert(
     movie = open_source(source, source_settings, metadata) if isinstance(source, str | Path) else source
     known = _overridden(movie.metadata, metadata)
     path = Path(destination).absolute()
-    origin, key = origin_of(movie), movie_key(movie, settings, source_settings)
     for note in known.notes:
         on_event(Warned(note))
     n_frames, n_y, n_x = movie.shape
@@ -108,15 +107,7 @@ def convert(
     layout = plan_layout(movie.shape, movie.dtype, settings)
     shards = split(n_frames, layout.frames_per_shard)
     _check_destination(path, movie, settings, source_settings, overwrite=overwrite)
-    same = _goes_on(path, key, origin.stamps, on_event)
-    stores.check_free_space(path, disk_bytes(layout, settings) - _size(path))
-    with stores.disk_errors(path):
-        if not same:
-            _clear(path)
-            about = provenance(key, settings) | _made(origin, settings, source_settings) | _remembered(movie)
-            about["source_settings"] = to_toml(source_settings)
-            _create(path, layout, settings.codec, about, known)
-        journal = Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
+    journal = _begun(path, movie, known, layout, settings, source_settings, on_event)
     on_event(announce(done_frames=journal.frames_done(shards)))
     statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
 
@@ -124,6 +115,7 @@ def convert(
         for name, values in statistics.items():
             values[shard.start : shard.stop] = payload[name]
 
+    origin = origin_of(movie)
     job = _Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps)
     with _unchanged(path, movie, origin):
         stream_shards(
@@ -141,6 +133,28 @@ def convert(
     journal.remove()
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
     return path
+
+
+def _begun(
+    path: Path,
+    movie: FrameSource,
+    known: SourceMetadata,
+    layout: Layout,
+    settings: ConvertSettings,
+    source_settings: SourceSettings,
+    on_event: Sink,
+) -> Journal:
+    """Return the journal of the store at ``path``, which is made anew unless it can be gone on with."""
+    origin, key = origin_of(movie), movie_key(movie, settings, source_settings)
+    same = _goes_on(path, key, origin.stamps, on_event)
+    stores.check_free_space(path, disk_bytes(layout, settings) - _size(path))
+    with stores.disk_errors(path):
+        if not same:
+            _clear(path)
+            about = provenance(key, settings) | _made(origin, settings, source_settings) | _remembered(movie)
+            about["source_settings"] = to_toml(source_settings)
+            _create(path, layout, settings.codec, about, known)
+        return Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))
 
 
 def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_event: Sink = silent) -> None:
@@ -172,22 +186,22 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
         )
     layout = plan_layout(source.shape, source.dtype, settings)
     chosen = [shard for shard in split(layout.shape[0], layout.frames_per_shard) if everything or shard.index in shards]
-    aside = path.with_name(f".{path.name}.repair")
-    stores.remove(aside)
-    aside.mkdir()
-    stamps = origin_of(source).stamps
-    job = _Job(_place(source), declared, path, aside, layout, settings.codec, stamps)
     frame_bytes = math.prod(layout.shape[1:]) * layout.dtype.itemsize
     on_event(StageStarted(STAGE, sum(shard.frames for shard in chosen), frame_bytes=frame_bytes))
     started = time.perf_counter()
     statistics = {name: np.empty(layout.shape[0]) for name in schema.STATISTICS}
-    for shard in chosen:
-        for name, values in _convert_shard(job, shard).items():
-            statistics[name][shard.start : shard.stop] = values
-        on_event(ShardDone(STAGE, shard.index, shard.frames))
+    aside = path.with_name(f".{path.name}.repair.partial")
+    stores.remove(aside)
+    with stores.disk_errors(path), ExitStack() as stack:
+        stack.callback(stores.remove, aside)
+        aside.mkdir()
+        job = _Job(_place(source), declared, path, aside, layout, settings.codec, origin_of(source).stamps)
+        for shard in chosen:
+            for name, values in _convert_shard(job, shard).items():
+                statistics[name][shard.start : shard.stop] = values
+            on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
         _finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
-    stores.remove(aside)
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made anew"))
 
 
@@ -622,13 +636,9 @@ def _is_zarr(folder: Path) -> bool:
 
 
 def _clear(path: Path) -> None:
-    """Remove a store and its journal; renamed first, so that what is at ``path`` is always whole."""
+    """Remove a store and its journal."""
     remove_journal(journal_beside(path))
-    aside = path.with_name(f".{path.name}.removed")
-    stores.remove(aside)
-    if path.exists():
-        path.replace(aside)
-    stores.remove(aside)
+    stores.remove(path)
 
 
 def _size(path: Path) -> int:

@@ -20,7 +20,9 @@ MODULE = __name__
 
 _TOPIC, _MEMORY_TOPIC = "tract_dask-deaths", "worker-restart-memory"
 _ANSWER_S = 2.0
-_CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL}
+
+CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL})
+"""Signals of which a process dies by a fault of its own code, and not because somebody ends it."""
 
 MOST_CRASHES, MOST_UNKNOWN = 2, 3
 """So many workers have to die on a shard that each has alone, by a crash or for unknown reasons, to blame its data."""
@@ -37,7 +39,7 @@ class Death:
     @property
     def is_crash(self) -> bool:
         """Whether it died of what it was doing: a fault in a compiled library."""
-        return self.code is not None and -self.code in _CRASHES and not self.out_of_memory
+        return self.code is not None and -self.code in CRASHES and not self.out_of_memory
 
     @property
     def is_of_node(self) -> bool:

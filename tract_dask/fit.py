@@ -14,8 +14,8 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import results, schema, stores
-from .errors import SettingsError, StoreError
-from .journal import Journal, Payload, journal_beside, remove_journal
+from .errors import SettingsError
+from .journal import Journal, Payload, journal_beside, left_over, remove_journal
 from .kernels.gaussian import blurred
 from .keyed import counted
 from .measure import Floats, Job, measure
@@ -306,9 +306,7 @@ def _load(movie: Movie, path: Path, key: str) -> Job:
     store = stores.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
     about = stores.attributes(path)
     if about.get("key") != key:
-        raise StoreError(
-            "a task is left over from an earlier run", str(path), f"key {key}", f"key {about.get('key')}", "Go on"
-        )
+        raise left_over(path, f"key {key}", f"key {about.get('key')}")
     bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
     vacuum = tuple(about["vacuum"]) if about["vacuum"] else None
     settings = from_toml(FitSettings, about["settings"], str(path))

@@ -57,12 +57,19 @@ def journal_beside(path: Path) -> Path:
 
 
 def remove_journal(folder: Path) -> None:
-    """Delete a journal, at once for all tasks that still write to it: renamed, then deleted."""
-    aside = folder.with_name(f".{folder.name}.removed")
-    remove(aside)
-    with suppress(FileNotFoundError):
-        folder.replace(aside)
-    remove(aside)
+    """Delete a journal, at once for all tasks that still write to it."""
+    remove(folder)
+
+
+def left_over(place: Path, expected: str, got: str) -> StoreError:
+    """Return the error for a task that an earlier run has left."""
+    return StoreError(
+        "a task is left over from an earlier run, and has written nothing more",
+        str(place),
+        expected,
+        got,
+        "Go on with the newer run: it does all shards itself",
+    )
 
 
 def own_file(run: Path, suffix: str) -> Path:
@@ -137,13 +144,9 @@ class Journal:
             Where another has taken its place, or it is over.
         """
         if self._run() != self.path.name:
-            raise StoreError(
-                "a task is left over from an earlier run, and has written nothing more",
-                str(self.folder),
-                f"run {self.path.name}",
-                f"run {_current(self.folder)[1]}" if _current(self.folder)[1] else "none: the run is over",
-                "Go on with the newer run: it does all shards itself",
-            ) from None
+            now = _current(self.folder)[1]
+            got = f"run {now}" if now else "none: the run is over"
+            raise left_over(self.folder, f"run {self.path.name}", got) from None
 
     @contextmanager
     def batch(self) -> Iterator[Callable[[Shard, Payload], None]]:

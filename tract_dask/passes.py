@@ -109,7 +109,7 @@ def load_saved(path: Path) -> NDArray[Any]:
             str(path),
             "an array with its checksum",
             str(error),
-            "Delete this file and run again: it is made anew",
+            "Remove this file if it is there, and run again: it is made anew",
         ) from error
     with sole_parser():
         array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)

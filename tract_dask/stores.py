@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
@@ -87,9 +87,11 @@ def attributes(path: Path) -> dict[str, Any]:
     """
     file = path / METADATA
     metadata = read_json(file)
+    if not metadata and _is_marked(path):
+        metadata = read_json(file)  # it may have been put there between the two looks
     found = metadata.get("attributes", {}).get(ATTRIBUTE)
     if not isinstance(found, dict):
-        if any((path / name / METADATA).exists() for name in _MARKS):
+        if _is_marked(path):
             raise damaged(file, "no metadata of tract_dask" if metadata else "no such file")
         return {}
     number, checksum = format_of(found), found.pop("checksum", None)
@@ -105,6 +107,11 @@ def attributes(path: Path) -> dict[str, Any]:
             "Install that version or a newer one, or remove the store and make it anew",
         )
     return found
+
+
+def _is_marked(path: Path) -> bool:
+    """Tell whether a folder holds arrays of ours."""
+    return any((path / name / METADATA).exists() for name in _MARKS)
 
 
 def format_of(about: Mapping[str, Any]) -> int:
@@ -331,11 +338,21 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
 
 
 def remove(path: Path) -> None:
-    """Delete a store, a folder or a file, if it is there."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
+    """Delete a store, a folder or a file, if it is there.
+
+    A folder goes at once for everybody who looks, also where this process is killed meanwhile: renamed, then deleted.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
         path.unlink(missing_ok=True)
+        return
+    if not path.name.startswith("."):
+        aside = path.with_name(f".{path.name}.removed")
+        remove(aside)  # of a process that was killed
+        with suppress(FileNotFoundError):
+            path.replace(aside)
+        path = aside
+    with suppress(FileNotFoundError):
+        shutil.rmtree(path)
 
 
 def check_destination(path: Path, *, overwrite: bool = False) -> None:

@@ -10,15 +10,12 @@ from time import perf_counter, sleep
 import numpy as np
 from distributed import Client
 
-from . import dispatch
-from .dispatch import Dispatch, Finished, Numbers, Tell, Work
+from .dispatch import BATCH_S, Dispatch, Finished, Numbers, Tell, Work
 from .errors import StoreError
 from .journal import Journal, Payload
 from .progress import Sink, Warned, silent
 from .shards import Shard
 from .tries import Place, Trouble, is_hopeless, trouble, wait_s
-
-_BATCH_S = dispatch.BATCH_S
 
 _ROUNDS = 3
 """So often shards are made that are not on disk afterwards."""
@@ -172,7 +169,7 @@ def _work(
         for index in batch.tolist():
             payloads.append(task(shards[index]))
             done(shards[index], payloads[-1])
-            if perf_counter() - began > _BATCH_S:
+            if perf_counter() - began > BATCH_S:
                 break
     return payloads, perf_counter() - began
 

@@ -100,6 +100,6 @@ def _readable(folder: Path, readers: Mapping[str, Any]) -> list[Path]:
             str(folder),
             "one format",
             ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
-            f"Choose by a glob, for example {folder}/*{next(iter(kinds))}",
+            f"Choose by a pattern, for example {folder}/*{next(iter(kinds))}",
         )
     return files

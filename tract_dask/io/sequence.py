@@ -1,4 +1,4 @@
-"""Many files, one movie: a folder or a glob, in the order of the numbers in their names."""
+"""Many files, one movie: a folder or a pattern, in the order of the numbers in their names."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _check_alike(part: Source, shape: tuple[int, int, int], dtype: np.dtype[Any]
             part.path,
             f"{shape[1]} x {shape[2]} {dtype}, as in {first}",
             f"{part.shape[1]} x {part.shape[2]} {part.dtype}",
-            "Take it out of the folder, or choose the frames by a glob",
+            "Take it out of the folder, or choose the frames by a pattern",
         )
 
 

@@ -100,7 +100,7 @@ def _ome(text: str, path: Path, n_pages: int) -> Description:
     notes = _one_axis(path, channels=channels, slices=slices, frames=times)
     spread = len({part.text for part in pixels.findall("{*}TiffData/{*}UUID")}) > 1
     if spread:
-        notes += (f"{path.name} is one part of a movie in several files; its folder or a glob opens all of them",)
+        notes += (f"{path.name} is one part of a movie in several files; its folder or a pattern opens all of them",)
     n_frames = max(channels, slices, times)
     x, y = (
         to_pm(_number(pixels.get(f"PhysicalSize{axis}", "")), pixels.get(f"PhysicalSize{axis}Unit", "µm"))

@@ -280,7 +280,8 @@ class NewJob(BaseModel):
     )
 
     source: RelativePath = Field(
-        min_length=1, description="The movie: a file, file.h5::/path/in/file, a folder, or a glob, under the data root."
+        min_length=1,
+        description="The movie: a file, file.h5::/path/in/file, a folder or a pattern below the data root.",
     )
     settings: SettingValues = Field(default_factory=dict, description="By group and name; the rest has its default.")
     label: Label = ""

@@ -7,10 +7,11 @@ from collections import OrderedDict
 from pathlib import Path
 from time import monotonic
 
+from ...deaths import CRASHES
 from ...errors import InputError
 
-CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE})
-"""Signals of which a process dies by a fault of its own code, and not because somebody ends it."""
+_CRASHES = CRASHES | {signal.SIGFPE}
+"""A process that does nothing but read this file, and divides by zero, does so by the file."""
 
 _KEPT_S = 600.0
 _MOST = 1000
@@ -32,7 +33,7 @@ def crash_of(code: int | None) -> str:
     >>> crash_of(-11), crash_of(-9), crash_of(1)
     ('SIGSEGV', '', '')
     """
-    return signal.Signals(-code).name if code is not None and -code in CRASHES else ""
+    return signal.Signals(-code).name if code is not None and -code in _CRASHES else ""
 
 
 def crashed(file: str, sign: str) -> CrashError:
