@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
@@ -20,7 +20,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from . import disk
 from .damage import CHECKED, METADATA, damaged, read_json, reading, unreadable
-from .errors import DestinationError, MissingStoreError, StoreError
+from .errors import DestinationError, MissingStoreError, StoreError, TractError
 from .schema import texts
 from .shard_files import CHUNK_KEYS, crc32c
 
@@ -333,9 +333,20 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
 def remove(path: Path) -> None:
     """Delete a store, a folder or a file, if it is there."""
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        abandon(path)
+        for item in path.iterdir():
+            if item.is_dir() and not item.is_symlink():
+                shutil.rmtree(item)
+        shutil.rmtree(path)  # its metadata last
     else:
         path.unlink(missing_ok=True)
+
+
+def abandon(path: Path) -> None:
+    """Say in a store that it is to be made anew, before it is deleted file by file: that may be interrupted."""
+    with suppress(OSError, TractError):  # on a full disk, and in what is damaged already, it is deleted all the same
+        if attributes(path).get("key"):
+            update_attributes(path, complete=False, key="")
 
 
 def check_destination(path: Path, *, overwrite: bool = False) -> None:
