@@ -1,6 +1,7 @@
 """Runs that lose processes: killed whole, killed in part, and spread over processes that were started by hand."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,10 +13,11 @@ import pytest
 import xarray as xr
 from conftest import Scene
 
-from tract_dask import pipeline
+from tract_dask import pipeline, stores
 from tract_dask.cluster import connect
 from tract_dask.progress import ShardDone
 from tract_dask.results import open_results
+from tract_dask.service import tidying
 from tract_dask.settings import ClusterSettings, ConvertSettings, RunSettings
 
 ROOT = Path(__file__).parent.parent
@@ -39,6 +41,29 @@ def client():
 def whole(movie, client) -> pipeline.RunOutcome:
     """What an uninterrupted run gives."""
     return pipeline.run(movie, movie.with_name("whole"), SETTINGS, client=client)
+
+
+@pytest.mark.parametrize(
+    ("name", "delete"),
+    [("movie.zarr", stores.remove), ("results.zarr", stores.remove), ("movie.zarr", tidying._remove)],
+)
+def test_a_deletion_that_was_interrupted_is_no_damage(movie, client, whole, tmp_path, monkeypatch, name, delete):
+    outputs = pipeline.Outputs(tmp_path / "run")
+    shutil.copytree(whole.outputs.root, outputs.root)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", killed_at)
+        patch.setattr(os, "walk", killed_at)
+        with pytest.raises(KeyboardInterrupt):
+            delete(outputs.root / name)
+    again = pipeline.run(movie, outputs.root, SETTINGS, client=client)
+    assert open_results(again.outputs.results).equals(open_results(whole.outputs.results))
+
+
+def killed_at(path: Path, **_: object) -> None:
+    """Delete the metadata of an array in a store, and stop."""
+    inside = path if path.suffix != ".zarr" else next(item for item in path.iterdir() if item.is_dir())
+    (inside / "zarr.json").unlink()
+    raise KeyboardInterrupt
 
 
 @pytest.mark.slow

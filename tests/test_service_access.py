@@ -172,7 +172,7 @@ def test_a_job_is_changed_by_its_owner_or_an_admin():
 
 
 def test_a_browser_logs_in_and_out(guarded, client, tokens):
-    answer = client.post("/login", data={"token": f" {tokens['user']}\n", "next": "/new?x=1"})
+    answer = client.post("/login", headers={"Origin": HERE}, data={"token": f" {tokens['user']}\n", "next": "/new?x=1"})
     assert (answer.status_code, answer.headers["location"]) == (303, "/new?x=1")
     cookie = answer.headers["set-cookie"]
     assert cookie.startswith("tract_dask_8000=")
@@ -190,8 +190,9 @@ def test_a_browser_logs_in_and_out(guarded, client, tokens):
 
 
 def test_a_cookie_under_tls_belongs_to_this_host_alone(guarded, tokens):
-    client = TestClient(guarded, base_url="https://tract.example.org", follow_redirects=False)
-    cookie = client.post("/login", data={"token": tokens["user"]}).headers["set-cookie"]
+    here = "https://tract.example.org"
+    client = TestClient(guarded, base_url=here, follow_redirects=False)
+    cookie = client.post("/login", headers={"Origin": here}, data={"token": tokens["user"]}).headers["set-cookie"]
     assert cookie.startswith("__Host-tract_dask=")
     assert "Secure" in cookie.split("; ")
     assert "Domain" not in cookie
@@ -214,14 +215,26 @@ def test_a_session_ends_with_its_token_and_with_its_time(guarded, tmp_path):
     "to", ["//evil.example", "https://evil.example", "/\\evil", "javascript:x", "/login", "/a\nb", ""]
 )
 def test_the_login_leads_nowhere_else(client, tokens, to):
-    assert client.post("/login", data={"token": tokens["user"], "next": to}).headers["location"] == "/"
+    assert (
+        client.post("/login", headers={"Origin": HERE}, data={"token": tokens["user"], "next": to}).headers["location"]
+        == "/"
+    )
+
+
+def test_another_site_cannot_log_a_browser_in(client, tokens):
+    for headers in (*FOREIGN, {}):  # every browser says where a form comes from
+        answer = client.post("/login", headers=headers, data={"token": tokens["user"]})
+        assert answer.status_code == 403, headers
+        assert "set-cookie" not in answer.headers
 
 
 def test_who_guesses_has_to_wait(client, tokens, monkeypatch):
     attempts = Attempts(limit=3, window_s=60.0, addresses=2)
     monkeypatch.setattr("tract_dask.service.entrance.login._attempts", attempts)
-    assert [client.post("/login", data={"token": "tract_0_x"}).status_code for _ in range(4)] == [401, 401, 401, 429]
-    assert client.post("/login", data={"token": tokens["user"]}).status_code == 429
+    assert [
+        client.post("/login", headers={"Origin": HERE}, data={"token": "tract_0_x"}).status_code for _ in range(4)
+    ] == [401, 401, 401, 429]
+    assert client.post("/login", headers={"Origin": HERE}, data={"token": tokens["user"]}).status_code == 429
     attempts.check("another")
     for address in ("b", "c"):
         attempts.failed(address)
@@ -245,7 +258,7 @@ OURS = [{"Origin": HERE}, {"Sec-Fetch-Site": "same-origin"}, {"Origin": HERE, "S
 
 
 def test_another_site_cannot_act_with_the_cookie(client, tokens):
-    client.post("/login", data={"token": tokens["user"]})
+    client.post("/login", headers={"Origin": HERE}, data={"token": tokens["user"]})
     path = "/api/v1/jobs/0123456789/cancel"
     for headers in (*FOREIGN, {}):  # a browser says one of the two; without, nothing is known
         assert client.post(path, headers=headers).status_code == 403, headers

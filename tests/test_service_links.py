@@ -95,6 +95,18 @@ def test_a_link_inside_of_an_hdf5_file_is_followed_within_the_data_root_only(api
             assert str(root.parent) not in text
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_nobody_learns_from_links_what_there_is_outside(api, root, kind):
+    outside = write_target(root.parent / "outside")
+    answers = []
+    for _ in range(2):
+        name = write_link(root / "probe.h5", kind, outside)
+        answers.append({route: status for route, (status, _) in ask_everywhere(api, name).items()})
+        for file in outside.iterdir():  # the second time nothing is there
+            file.unlink()
+    assert answers[0] == answers[1] == dict.fromkeys(answers[0], 403)
+
+
 def test_a_link_to_the_services_own_folder_is_refused(root):
     state = root / "state"
     app = TestClient(make_app(root, state_dir=state), base_url=URL)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -19,6 +20,7 @@ from .schema import Status
 from .small_files import read_small
 
 _FIT_COLUMNS = tuple(name for name in schema.PARAMETERS if name not in ("x", "y"))
+_FLAGS = {str(flag.name).lower(): int(flag) for flag in Status if flag}
 MOST_BYTES = 64 << 20
 """Bytes of a table of columns."""
 MOST_ROWS = 500_000
@@ -218,16 +220,15 @@ def columns_csv(columns: xr.Dataset) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["column_id", "x", "y", "kind", *_FIT_COLUMNS, "flags"])
     for column, (x, y), kind, fit, status in zip(
-        columns["column_id"].to_numpy(),
-        positions(columns),
+        columns["column_id"].to_numpy().tolist(),
+        positions(columns).tolist(),
         columns["kind"].to_numpy(),
-        fits,
-        columns["status_ref"].to_numpy(),
+        fits.tolist(),
+        columns["status_ref"].to_numpy().tolist(),
         strict=True,
     ):
-        numbers = [repr(float(value)) if np.isfinite(value) else "" for value in fit]
-        flags = " ".join(flag_names(int(status)))
-        writer.writerow([int(column), repr(float(x)), repr(float(y)), str(kind), *numbers, flags])
+        numbers = [repr(value) if math.isfinite(value) else "" for value in fit]
+        writer.writerow([column, repr(x), repr(y), str(kind), *numbers, " ".join(flag_names(status))])
     return text.getvalue()
 
 
@@ -239,7 +240,7 @@ def flag_names(status: int) -> list[str]:
     >>> flag_names(9)
     ['below_noise', 'outside_frame']
     """
-    return [str(flag.name).lower() for flag in Status if flag and status & flag]
+    return [name for name, flag in _FLAGS.items() if status & flag]
 
 
 def write_columns_csv(columns: xr.Dataset, path: str | Path) -> None:
@@ -348,7 +349,7 @@ class _Row:
             value = float(self.values.get(name, ""))
         except ValueError:
             value = float("nan")
-        if not np.isfinite(value):
+        if not math.isfinite(value):
             raise self._error(name, "a number")
         return value
 
@@ -359,11 +360,10 @@ class _Row:
         return int(text)
 
     def flags(self) -> int:
-        names = {str(flag.name).lower(): int(flag) for flag in Status if flag}
-        found = self.values.get("flags", "").split()
-        if not set(found) <= set(names):
-            raise self._error("flags", f"some of {', '.join(names)}")
-        return sum(names[name] for name in set(found))
+        found = set(self.values.get("flags", "").split())
+        if not found <= _FLAGS.keys():
+            raise self._error("flags", f"some of {', '.join(_FLAGS)}")
+        return sum(_FLAGS[name] for name in found)
 
     def _error(self, name: str, expected: str) -> SettingsError:
         got = repr(self.values[name]) if name in self.values else "nothing"

@@ -20,7 +20,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from . import disk
 from .damage import CHECKED, METADATA, damaged, read_json, reading, unreadable
-from .errors import DestinationError, MissingStoreError, StoreError
+from .errors import DestinationError, MissingStoreError, StoreError, TractError
 from .schema import texts
 from .shard_files import CHUNK_KEYS, crc32c
 
@@ -353,6 +353,13 @@ def remove(path: Path) -> None:
         path = aside
     with suppress(FileNotFoundError):
         shutil.rmtree(path)
+
+
+def abandon(path: Path) -> None:
+    """Say in a store that it is to be made anew, before it is deleted file by file: that may be interrupted."""
+    with suppress(OSError, TractError):  # on a full disk, and in what is damaged already, it is deleted all the same
+        if attributes(path).get("key"):
+            update_attributes(path, complete=False, key="")
 
 
 def check_destination(path: Path, *, overwrite: bool = False) -> None:

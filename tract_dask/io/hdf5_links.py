@@ -44,6 +44,11 @@ class Access:
         self.files[path] = None
         return status
 
+    def check_absent(self, path: Path) -> None:
+        """Refuse a path that may not be opened although nothing is there: what others have is not to be told."""
+        if self.permit is not None:
+            self.permit(Path(os.path.realpath(path)))
+
 
 @dataclass(frozen=True)
 class Found:
@@ -105,7 +110,7 @@ def follow(file: Any, path: str, access: Access, stack: ExitStack) -> Any:
                 remedy="Name the data set by another path",
             )
         if isinstance(link, h5py.ExternalLink):
-            at = stack.enter_context(opened(_target(at, part, link), access))["/"]
+            at = stack.enter_context(opened(_target(at, part, link, access), access))["/"]
         elif link.path.startswith("/"):
             at = at.file["/"]
         parts.extendleft(reversed(_parts(link.path)))
@@ -144,7 +149,7 @@ def _search(group: Any, shown: str, access: Access, search: Search, depth: int) 
 def _search_outside(at: Any, name: str, shown: str, access: Access, search: Search, depth: int) -> None:
     link = at.get(name, getlink=True)
     holder = Path(at.file.filename)
-    target = _existing(link.filename, holder, "HDF5_EXT_PREFIX")
+    target = _existing(link.filename, holder, "HDF5_EXT_PREFIX", access)
     if target is None:
         search.lost.append(f"{shown} leads to {link.filename}, which is not there")
         return
@@ -305,7 +310,7 @@ def _virtual_source(
 ) -> Any:
     """Return a source of a virtual data set; None where an optional one is not there."""
     holder = Path(dataset.file.filename)
-    path = holder if name == "." else _existing(name, holder, "HDF5_VDS_PREFIX")
+    path = holder if name == "." else _existing(name, holder, "HDF5_VDS_PREFIX", access)
     if path is None:
         if optional:
             return None
@@ -339,7 +344,8 @@ def _segment(dataset: Any, name: str, offset: int, size: int, access: Access, *,
         )
     prefix = os.environ.get("HDF5_EXTFILE_PREFIX", "").replace("${ORIGIN}", str(holder.parent))
     path = (Path(prefix) if prefix else holder.parent) / name
-    if not path.exists():
+    if not _is_there(path):
+        access.check_absent(path)
         raise _missing(holder, dataset.name, str(path), "a file of raw pixels is missing")
     status = access.check(path)
     n_bytes = max(0, status.st_size - offset) if size == h5py.h5s.UNLIMITED else size
@@ -350,23 +356,38 @@ def _segment(dataset: Any, name: str, offset: int, size: int, access: Access, *,
     return Segment(path, offset, n_bytes)
 
 
-def _target(group: Any, name: str, link: Any) -> Path:
+def _target(group: Any, name: str, link: Any, access: Access) -> Path:
     """Return the file that an external link leads to."""
     holder = Path(group.file.filename)
-    path = _existing(link.filename, holder, "HDF5_EXT_PREFIX")
+    path = _existing(link.filename, holder, "HDF5_EXT_PREFIX", access)
     if path is None:
         shown = f"{group.name.rstrip('/')}/{name}"
         raise _missing(holder, shown, link.filename, "the file that an external link leads to is missing")
     return path
 
 
-def _existing(name: str, holder: Path, variable: str) -> Path | None:
+def _existing(name: str, holder: Path, variable: str, access: Access) -> Path | None:
     """Return the first place where libhdf5 looks for another file and there is something."""
+    named = holder.parent / name
     prefixes = [prefix for prefix in os.environ.get(variable, "").split(":") if prefix]
     prefixes += [prefix.replace("${ORIGIN}", str(holder.parent)) for prefix in prefixes if "${ORIGIN}" in prefix]
     name, absolute = (Path(name).name, [Path(name)]) if Path(name).is_absolute() else (name, [])
     folders = [*map(Path, prefixes), holder.parent, Path(), Path(os.path.realpath(holder)).parent]
-    return next((path for path in (*absolute, *(folder / name for folder in folders)) if path.exists()), None)
+    found = next((path for path in (*absolute, *(folder / name for folder in folders)) if _is_there(path)), None)
+    if found is None:
+        access.check_absent(named)
+    return found
+
+
+def _is_there(path: Path) -> bool:
+    """Tell whether there is something; also where only others may look at it."""
+    try:
+        path.stat()
+    except PermissionError:
+        return True
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _missing(holder: Path, inner: str, name: str, what: str) -> SourceError:

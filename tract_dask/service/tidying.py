@@ -93,6 +93,7 @@ def _remove(path: Path) -> None:
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
+    stores.abandon(path)
     for folder, _, names in os.walk(path, topdown=False):
         for file in (Path(folder, name) for name in names if _OF_A_STORE.fullmatch(name)):
             if not file.is_symlink():

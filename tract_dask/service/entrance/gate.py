@@ -93,7 +93,8 @@ class Gate:
         foreign_site = site not in _SAME_SITE and not came_from_link
         acts = method not in _SAFE or scope["type"] == "websocket"
         foreign_origin = acts and bool(origin) and urlsplit(origin).netloc not in {host, *self.config.allowed_hosts}
-        unknown = acts and not origin and not site and "cookie" in headers
+        is_browser = "cookie" in headers or scope["path"] == LOGIN  # programs have no use for a login
+        unknown = acts and is_browser and not origin and not site
         if foreign_site or foreign_origin or unknown:
             raise ForbiddenError(
                 "the request comes from another site",
