@@ -217,6 +217,23 @@ def test_vacuum_is_found_above_the_crystal_and_not_inside_it(scene):
     assert min(y1 - y0, x1 - x0) >= 24
 
 
+def test_padding_is_no_vacuum(scene):
+    summed = scene.summed()
+    summed["image"] += np.random.default_rng(0).normal(0, 1, summed["image"].shape)
+    padded = summed.pad(y=(0, 0), x=(0, 96), constant_values=0)  # a flat square larger than any of vacuum
+    padded["exposure"][:] = summed["exposure"].max()
+    y0, y1, x0, x1 = find_vacuum(padded, scene.columns(), 2.0)
+    assert x1 <= summed.sizes["x"] + 1
+    assert padded["image"][y0:y1, x0:x1].std() > 0
+
+
+def test_vacuum_without_noise_is_vacuum(scene):
+    summed = scene.summed()
+    summed["image"][:64] = summed["image"][:24].mean()  # no edge
+    y0, y1, x0, x1 = find_vacuum(summed, scene.columns(), 2.0)
+    assert summed["image"][y0:y1, x0:x1].std() == 0
+
+
 def test_a_field_without_vacuum_takes_its_noise_from_the_residuals(scene, make_movie):
     left, top = scene.place.min(axis=0).astype(int)
     right, bottom = scene.place.max(axis=0).astype(int)

@@ -276,6 +276,26 @@ def test_run_toml_gives_the_same_settings_and_says_what_was_unset(job):
     assert "# cluster.scheduler  (" in text
 
 
+def test_a_name_may_hold_two_colons(done):
+    done.output = done.output.rename(done.output.parent / "a::b [1] c")
+    assert done().reused == STAGES
+    expected = open_results(done.output / "results.zarr")["fit"].load()
+    assert done(overwrite=True).state == "done"
+    xr.testing.assert_identical(open_results(done.output / "results.zarr")["fit"].load(), expected)
+
+
+def test_columns_move_with_a_drift_that_gives_the_same_image(done, tmp_path):
+    drift = xr.open_zarr(done.output / "drift.zarr", consolidated=False)["drift"].to_numpy()
+    whole, moved = np.rint(drift), np.rint(drift) + 0.3
+    places = []
+    for shift in (whole, moved):
+        table = np.column_stack([np.arange(len(shift)), shift])
+        np.savetxt(tmp_path / "drift.csv", table, delimiter=",", header="frame,y,x", comments="")
+        done(change(drift={"method": "csv", "csv": str(tmp_path / "drift.csv")}))
+        places.append(open_results(done.output / "results.zarr")["x_ref"].to_numpy())
+    np.testing.assert_allclose(places[0] - places[1], 0.3, atol=0.01)
+
+
 def test_single_stages_end_as_the_run_does(base, tmp_path):
     expected = open_results(base.output / "results.zarr").load()
     movie, drift, columns, results = (tmp_path / name for name in ("m.zarr", "d.zarr", "c.csv", "r.zarr"))

@@ -545,8 +545,8 @@ def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known
     """Make the store with all its arrays, still empty: whole or not at all."""
     aside = path.with_name(f".{path.name}.partial")
     stores.remove(aside)
-    zarr.create_group(str(aside), zarr_format=3)
-    zarr.create_group(str(aside / "binned"), zarr_format=3)
+    zarr.create_group(aside, zarr_format=3)
+    zarr.create_group(aside / "binned", zarr_format=3)
     _create_array(aside / "0", layout.grid(), layout.dtype, codec)
     for factor in layout.bins:
         _create_array(aside / "binned" / str(factor), layout.grid(factor), LEVEL_DTYPE, codec)
@@ -569,7 +569,7 @@ def _create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known
 
 def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> zarr.Array[Any]:
     return zarr.create_array(
-        str(path),
+        path,
         shape=grid.shape,
         chunks=grid.chunk,
         shards=grid.shard,
@@ -584,7 +584,7 @@ def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> z
 
 def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: dict[str, Any] | None = None) -> None:
     zarr.create_array(
-        str(path),
+        path,
         shape=(length,),
         chunks=(length,),
         dtype=dtype,

@@ -23,7 +23,7 @@ def describe(path: Path, ours: dict[str, Any]) -> None:
         ("x", ours["shape"][2], pixel, ("pm", "px")),
     ):
         stores.overwrite_array(path / axis, np.arange(length) * (step or 1.0))
-        zarr.open_array(str(path / axis), mode="r+").attrs["units"] = units[0] if step else units[1]
+        zarr.open_array(path / axis, mode="r+").attrs["units"] = units[0] if step else units[1]
     root = read_json(path / METADATA)
     root["attributes"] = {
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),

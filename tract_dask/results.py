@@ -76,7 +76,7 @@ def create(
     with stores.disk_errors(path):
         stores.remove(aside)
         stores.write_arrays(static, aside)
-        group = zarr.open_group(str(aside), mode="a")
+        group = zarr.open_group(aside, mode="a")
         for variable in map(schema.RESULTS.__getitem__, SHARDED):
             shape = tuple(sizes[dim] for dim in variable.dims)
             group.create_array(

@@ -142,7 +142,7 @@ def columns_stage(
             "Choose another place, say --overwrite, or give the table as --columns",
         )
     counts = counted("columns", columns=settings, fit=fit_settings)
-    key = stage_key("columns", summed["image"].to_numpy(), counts, before.seeds)
+    key = _columns_key(summed, counts, before.seeds)
     about, pixel_size = before.about, summed.attrs.get("pixel_size_pm")
     same = bool(before.content) and about.get("key") == key
     if same and figure.exists() and about.get("pixel_size_pm") == pixel_size:
@@ -154,7 +154,7 @@ def columns_stage(
         found, edited = _reopened(store), before.is_edited
     else:
         found, edited = _found(find, before, settings, on_event)
-        key = stage_key("columns", summed["image"].to_numpy(), counts, before.content if edited else before.given)
+        key = _columns_key(summed, counts, before.content if edited else before.given)
     found.attrs["pixel_size_pm"] = pixel_size
     table = before.content if same or edited else _render(found, csv)
     if table != before.content:
@@ -167,6 +167,12 @@ def columns_stage(
     aside(partial(_draw, summed, found.copy(), figure))
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
     return found
+
+
+def _columns_key(summed: xr.Dataset, counts: dict[str, Any], seeds: bytes) -> str:
+    """Return the key of the columns: other drifts may give the same image, but displaced, or of fewer frames."""
+    image, exposure = (summed[name].to_numpy() for name in ("image", "exposure"))
+    return stage_key("columns", image, exposure, summed.attrs.get("rounding_px"), counts, seeds)
 
 
 @dataclass(frozen=True)

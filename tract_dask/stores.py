@@ -17,6 +17,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.storage import LocalStore
 
 from . import disk
 from .damage import CHECKED, METADATA, damaged, read_json, reading, unreadable
@@ -70,7 +71,7 @@ def open_array(path: Path) -> zarr.Array[Any]:
     _check_nodes(store, about, [path.relative_to(store).as_posix()])
     try:
         with _configured(CHECKED if _is_whole(about) else {}), _opening(path):
-            return zarr.open_array(str(path), mode="r", zarr_format=3)
+            return zarr.open_array(path, mode="r", zarr_format=3)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError) as error:
         raise StoreError("there is no Zarr array here", str(path), remedy="Run the stage that writes it") from error
 
@@ -270,7 +271,7 @@ def write_arrays(dataset: xr.Dataset, path: Path) -> None:
     dataset = dataset.assign({name: (word.dims, texts(word.to_numpy()), word.attrs) for name, word in words.items()})
     how = {"compressors": (ZstdCodec(), Crc32cCodec()), "chunk_key_encoding": CHUNK_KEYS}
     dataset.to_zarr(
-        path,
+        LocalStore(path),
         mode="w",
         zarr_format=3,
         consolidated=False,
@@ -282,7 +283,7 @@ def write_arrays(dataset: xr.Dataset, path: Path) -> None:
 def overwrite_array(path: Path, values: NDArray[Any]) -> None:
     """Write all values of an array of a store anew."""
     with _configured(_WRITE_ALL):
-        zarr.open_array(str(path), mode="r+", zarr_format=3)[...] = values
+        zarr.open_array(path, mode="r+", zarr_format=3)[...] = values
 
 
 def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
@@ -331,7 +332,7 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
     whole = format_of(about) >= FORMAT and not partial
     try:
         with _configured(CHECKED if whole else {}), _opening(path):
-            opened: xr.Dataset = xr.open_zarr(path, consolidated=False, chunks=None)
+            opened: xr.Dataset = xr.open_zarr(LocalStore(path, read_only=True), consolidated=False, chunks=None)
     except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
         raise MissingStoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
     return opened

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from .errors import SettingsError
 from .kernels.filters import blur
@@ -16,6 +17,8 @@ from .schema import AMPLITUDE
 _SHARES = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8)
 _FLAT = 0.1
 _MIN_SIDE_PX = 24
+_PADDING_PX, _EDGE = 17, 0.05
+"""Padding is a square of this side at least, whose edge is this share of the columns' amplitude."""
 _STEPS = 16
 """Squares are looked for in steps of this share of the smallest one's side."""
 
@@ -26,7 +29,8 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
     Parameters
     ----------
     summed
-        Summed image with its exposure (:data:`schema.SUM`); only pixels that every frame covers are looked at.
+        Summed image with its exposure (:data:`schema.SUM`); only pixels that every frame covers are looked at, and
+        none that frames were padded with, as those that were aligned before are.
     columns
         The columns: their median amplitude is what flatness is held against.
     sigma
@@ -40,11 +44,11 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
     """
     image = np.asarray(summed["image"].to_numpy(), dtype=np.float64)
     exposure = summed["exposure"].to_numpy()
-    covered = exposure == exposure.max()
     unit = unit_of(image)
     smooth = blur((image if unit == 1 else image / unit).astype(np.float32), sigma)
     smooth -= smooth.mean(dtype=np.float64)
     amplitude = float(np.nanmedian(np.abs(columns["fit_ref"].to_numpy()[:, AMPLITUDE]))) / unit
+    covered = (exposure == exposure.max()) & ~_is_padding(image / unit, amplitude)
     sides = [side for share in _SHARES if (side := int(share * min(image.shape))) >= _MIN_SIDE_PX]
     step = max(1, min(sides, default=1) // _STEPS)
     sides = [side // step * step for side in sides]
@@ -90,6 +94,20 @@ def check_box(
             str(box),
             "Move it inwards or make it smaller",
         )
+
+
+def _is_padding(image: NDArray[np.float64], amplitude: float) -> NDArray[np.bool_]:
+    """Tell which pixels lie in areas of one value behind a sharp edge, as where frames were padded with zeros.
+
+    Vacuum without noise ends in slopes of columns, and not in an edge.
+    """
+    constant = np.zeros(image.shape, np.uint8)
+    constant[:-1, :-1] = (image[:-1, :-1] == image[1:, :-1]) & (image[:-1, :-1] == image[:-1, 1:])
+    constant[-1], constant[:, -1] = constant[-2], constant[:, -2]
+    padding: NDArray[np.bool_] = ndimage.grey_opening(constant, size=(_PADDING_PX, _PADDING_PX)).astype(bool)
+    steps = [np.abs(np.diff(image, axis=axis))[np.diff(padding, axis=axis)] for axis in (0, 1)]
+    edge = np.concatenate(steps)
+    return padding if edge.size and np.median(edge) > _EDGE * amplitude else np.zeros_like(padding)
 
 
 def _sum_table(values: NDArray[Any], step: int) -> NDArray[np.float64]:

@@ -150,7 +150,7 @@ def sum_levels(folder: Path, view: View, stamp: str) -> bytes:
     """Return what values the summed image of a run has, and the size of its pixels."""
     path = folder / "sum.zarr"
     found = levels(sum_plane(path, stamp), view)
-    pixel_size = zarr.open_group(str(path), mode="r").attrs.get("pixel_size_pm")
+    pixel_size = zarr.open_group(path, mode="r").attrs.get("pixel_size_pm")
     return as_json(found | {"pixel_size_pm": pixel_size, "version": stamp})
 
 
