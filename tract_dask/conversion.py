@@ -24,7 +24,7 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import disk, schema, stores
-from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError
+from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError, StoreError
 from .io import FrameSource, SourceMetadata, open_source
 from .io.source import Source, reading
 from .journal import Journal, Payload, journal_beside, remove_journal
@@ -98,7 +98,8 @@ def convert(
     n_frames, n_y, n_x = movie.shape
     announce = partial(StageStarted, STAGE, n_frames, frame_bytes=n_y * n_x * movie.dtype.itemsize)
 
-    if is_converted(path, movie, settings, source_settings):
+    replaces = overwrite and not stores.is_sound(path)
+    if not replaces and is_converted(path, movie, settings, source_settings):
         update_metadata(path, known, **_remembered(movie))
         remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
@@ -108,7 +109,7 @@ def convert(
     layout = plan_layout(movie.shape, movie.dtype, settings)
     shards = split(n_frames, layout.frames_per_shard)
     _check_destination(path, movie, settings, source_settings, overwrite=overwrite)
-    same = _goes_on(path, key, origin.stamps, on_event)
+    same = not replaces and _goes_on(path, key, origin.stamps, on_event)
     stores.check_free_space(path, disk_bytes(layout, settings) - _size(path))
     with stores.disk_errors(path):
         if not same:
@@ -416,6 +417,11 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
         return False
     if stamps.total_bytes > WHOLE_BYTES and present.get("written") != stamps.written:
         on_event(Warned("the movie was written again since its conversion was interrupted, which begins anew"))
+        return False
+    try:
+        stores.check_nodes(path, present, AXES)
+    except StoreError as error:
+        on_event(Warned(f"{error.where} is damaged: the conversion, which was interrupted, begins anew"))
         return False
     return True
 

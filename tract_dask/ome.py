@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,14 @@ AXES = ("t", "y", "x")
 
 
 def describe(path: Path, ours: dict[str, Any]) -> None:
-    """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own."""
+    """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own.
+
+    Raises
+    ------
+    StoreError
+        Where metadata of the store are damaged; nothing is written then.
+    """
+    stores.check_nodes(path, ours, AXES)
     frame_time, pixel = ours["frame_time_s"], ours["pixel_size_pm"]
     for axis, length, step, units in (
         ("t", ours["shape"][0], frame_time, ("s", "frame")),
@@ -24,7 +30,7 @@ def describe(path: Path, ours: dict[str, Any]) -> None:
     ):
         stores.overwrite_array(path / axis, np.arange(length) * (step or 1.0))
         zarr.open_array(str(path / axis), mode="r+").attrs["units"] = units[0] if step else units[1]
-    root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    root = stores.read_json(path / "zarr.json")
     root["attributes"] = {
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),
         stores.ATTRIBUTE: ours,
@@ -42,7 +48,7 @@ def _nodes(path: Path) -> dict[str, Any]:
         "binned",
         *(f"binned/{file.name}" for file in (path / "binned").glob("[0-9]*")),
     )
-    return {name: json.loads((path / name / "zarr.json").read_text(encoding="utf-8")) for name in names}
+    return {name: stores.read_json(path / name / "zarr.json") for name in names}
 
 
 def _ome_metadata(name: str, bins: tuple[int, ...], pixel: float | None, frame_time: float | None) -> dict[str, Any]:

@@ -276,7 +276,8 @@ def run(
         check_output(outputs, opened, settings, overwrite=overwrite)
         with sole_run(outputs, patience_s):
             if overwrite:
-                clear_run(outputs, on_event, keep_edited=is_movie_of(outputs.movie, opened))
+                same = stores.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened)
+                clear_run(outputs, on_event, keep_edited=same)
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -620,6 +621,21 @@ def check_output(
         raise DestinationError(
             "this place holds something else", str(root), "a folder", "a file", "Choose another place"
         )
+    for path in (
+        outputs.columns,
+        outputs.columns.with_suffix(".png"),
+        outputs.report,
+        outputs.settings,
+        outputs.events,
+    ):
+        if path.is_dir():
+            raise DestinationError(
+                "a folder lies where a file is written",
+                str(path),
+                "a file, or nothing",
+                "a folder",
+                "Move it elsewhere",
+            )
     others = sorted(path.name for path in root.glob("[!.]*"))
     if others and not ours and not overwrite:
         raise DestinationError(
