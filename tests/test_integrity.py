@@ -18,7 +18,7 @@ from distributed import Client, LocalCluster
 
 from tract_dask import pipeline, stores
 from tract_dask.cli import main
-from tract_dask.errors import MissingStoreError, StoreError
+from tract_dask.errors import DestinationError, MissingStoreError, StoreError
 from tract_dask.journal import Journal, journal_beside
 from tract_dask.movie import open_movie
 from tract_dask.parts import SHARDED, write

@@ -9,6 +9,7 @@ import numpy as np
 import zarr
 
 from . import schema, stores
+from .damage import METADATA, read_json
 
 AXES = ("t", "y", "x")
 
@@ -30,7 +31,7 @@ def describe(path: Path, ours: dict[str, Any]) -> None:
     ):
         stores.overwrite_array(path / axis, np.arange(length) * (step or 1.0))
         zarr.open_array(str(path / axis), mode="r+").attrs["units"] = units[0] if step else units[1]
-    root = stores.read_json(path / "zarr.json")
+    root = read_json(path / METADATA)
     root["attributes"] = {
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),
         stores.ATTRIBUTE: ours,
@@ -48,7 +49,7 @@ def _nodes(path: Path) -> dict[str, Any]:
         "binned",
         *(f"binned/{file.name}" for file in (path / "binned").glob("[0-9]*")),
     )
-    return {name: stores.read_json(path / name / "zarr.json") for name in names}
+    return {name: read_json(path / name / METADATA) for name in names}
 
 
 def _ome_metadata(name: str, bins: tuple[int, ...], pixel: float | None, frame_time: float | None) -> dict[str, Any]:

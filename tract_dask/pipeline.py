@@ -621,20 +621,10 @@ def check_output(
         raise DestinationError(
             "this place holds something else", str(root), "a folder", "a file", "Choose another place"
         )
-    for path in (
-        outputs.columns,
-        outputs.columns.with_suffix(".png"),
-        outputs.report,
-        outputs.settings,
-        outputs.events,
-    ):
-        if path.is_dir():
+    for path in outputs.written():
+        if path.suffix != ".zarr" and path.is_dir():
             raise DestinationError(
-                "a folder lies where a file is written",
-                str(path),
-                "a file, or nothing",
-                "a folder",
-                "Move it elsewhere",
+                "a folder lies where a file is written", str(path), "a file, or nothing", "a folder", "Move it away"
             )
     others = sorted(path.name for path in root.glob("[!.]*"))
     if others and not ours and not overwrite:
