@@ -19,7 +19,7 @@ from distributed import Client, LocalCluster
 from tract_dask import damage as damages
 from tract_dask import pipeline, stores
 from tract_dask.cli import main
-from tract_dask.errors import MissingStoreError, StoreError
+from tract_dask.errors import DestinationError, MissingStoreError, StoreError
 from tract_dask.journal import Journal, journal_beside
 from tract_dask.movie import open_movie
 from tract_dask.parts import SHARDED, write
@@ -317,8 +317,19 @@ def test_damaged_metadata_are_neither_overwritten_nor_taken_for_nothing(run, cop
     assert arrays_of(file.parent) == whole
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_in_the_place_of_a_file_is_refused(run, copy, overwrite):
+    for name in ("columns.csv", "report.html", "events.jsonl"):
+        (copy / name).unlink(missing_ok=True)
+        (copy / name).mkdir()
+        with pytest.raises(DestinationError, match="a folder lies where a file is written"):
+            pipeline.run(run.parent / "movie.npy", copy, SETTINGS, report=False, overwrite=overwrite)
+        (copy / name).rmdir()
+
+
 def test_overwrite_replaces_a_damaged_run(run, copy):
     (copy / "movie.zarr" / "zarr.json").write_bytes(b"")
+    (copy / "columns.zarr" / "zarr.json").write_bytes(b"noise")
     with (
         LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
         Client(local) as client,
@@ -327,6 +338,7 @@ def test_overwrite_replaces_a_damaged_run(run, copy):
             run.parent / "movie.npy", copy, SETTINGS, client=client, report=False, until="convert", overwrite=True
         )
     assert arrays_of(copy / "movie.zarr") == arrays_of(run / "movie.zarr")
+    assert not (copy / "columns.zarr").exists()
 
 
 def command(*args) -> tuple[int, str]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from tract_dask.progress import ShardDone, Warned
 from tract_dask.settings import ColumnSettings, ConvertSettings, DriftSettings, FitSettings, to_toml
 from tract_dask.shard_files import crc32c
 from tract_dask.shards import Shard, split
+from tract_dask.stages import drift_stage, sum_stage
 from tract_dask.summing import sum_image
 
 SMALL = ConvertSettings(tile_px=32)
@@ -280,8 +282,12 @@ def test_a_disk_that_loses_what_is_written_ends_the_stage(tmp_path):
         (journal.path / f"{shard.index}.npy").unlink()
 
     journal = Journal(tmp_path / "j", "key")
+    said: list[Any] = []
     with pytest.raises(StoreError, match="10 shards of stage lose were written, and are not on disk"):
-        tasks.stream_shards(lose, split(10, 1), lambda *_: None, journal=journal, name="lose", on_done=vanish)
+        tasks.stream_shards(
+            lose, split(10, 1), lambda *_: None, journal=journal, name="lose", on_done=vanish, on_event=said.append
+        )
+    assert [event.message.partition(":")[2] for event in said] == [" they are made again"] * 2
 
 
 def test_files_are_synced_before_they_are_renamed_and_renamed_before_they_are_journaled(tmp_path, monkeypatch):
@@ -563,3 +569,94 @@ def test_parts_of_another_shard_are_refused(tmp_path):
     place = np.array([[0, 300], [-1, -1]])
     with pytest.raises(StoreError, match="shard 0 cannot be read"):
         parts.Parts(journal.path, ("x.parts",), place).read(0, "fit", np.empty((1, 1, 7)))
+
+
+# Damage that is found late
+
+CONFUSED = [lambda data: data[: len(data) // 2], lambda data: b"", lambda data: data.replace(b"shape", b"shale"), None]
+
+
+@pytest.mark.parametrize("confuse", CONFUSED)
+@pytest.mark.parametrize("name", ["0", "binned/4", "frame_max"])
+def test_an_unfinished_movie_with_damaged_metadata_is_begun_anew(scene, npy, tmp_path, name, confuse):
+    movie, said = npy(scene.counts()), []
+    with pytest.raises(Stopped):
+        convert(movie, tmp_path / "m.zarr", settings=SMALL, on_event=stop_after(2))
+    harm(tmp_path / "m.zarr" / name / "zarr.json", confuse)
+    convert(movie, tmp_path / "m.zarr", settings=SMALL, on_event=said.append)
+    convert(movie, tmp_path / "whole.zarr", settings=SMALL)
+    assert files(tmp_path / "m.zarr") == files(tmp_path / "whole.zarr")
+    assert any("is damaged" in event.message for event in said if isinstance(event, Warned))
+
+
+@pytest.mark.parametrize("confuse", CONFUSED)
+@pytest.mark.parametrize("file", ["fit/zarr.json", "fit_ref/c.0.0", "axis/zarr.json"])
+def test_unfinished_results_that_are_damaged_keep_the_fits_that_are_done(movie, scene, tmp_path, file, confuse):
+    columns, said = scene.columns(), []
+    job = prepare(movie, columns, scene.drift_dataset(), FitSettings())
+    with pytest.raises(Stopped):
+        fit_movie(movie, columns, job, tmp_path / "r.zarr", on_event=stop_after(3))
+    harm(tmp_path / "r.zarr" / file, confuse if file.endswith("json") or confuse != CONFUSED[2] else zeros)
+    fit_movie(movie, columns, job, tmp_path / "r.zarr", on_event=said.append)
+    fit_movie(movie, columns, job, tmp_path / "whole.zarr")
+    assert len([event for event in said if isinstance(event, ShardDone)]) == len(movie.shards) - 3
+    assert any("is damaged" in event.message for event in said if isinstance(event, Warned))
+    found, whole = (open_results(tmp_path / f"{name}.zarr").drop_attrs().load() for name in ("r", "whole"))
+    xr.testing.assert_identical(found, whole)
+
+
+@pytest.mark.parametrize("stage_of", [sum_stage, drift_stage])
+def test_a_bit_that_flipped_in_what_a_task_left_is_made_again(movie, scene, tmp_path, stage_of):
+    how = {sum_stage: scene.drift_dataset(), drift_stage: DriftSettings()}[stage_of]
+    args = (movie, how) if stage_of is sum_stage else (movie,)
+    more = () if stage_of is sum_stage else (how,)
+    with pytest.raises(Stopped):
+        stage_of(*args, tmp_path / "a.zarr", *more, lambda: None, stop_after(2))
+    left = next(journal_beside(tmp_path / "a.zarr").rglob("0.npy"))
+    data = bytearray(left.read_bytes())
+    data[200] ^= 4  # not at the end, of which the journal knows
+    left.write_bytes(data)
+    said: list[Any] = []
+    found = stage_of(*args, tmp_path / "a.zarr", *more, lambda: None, said.append)
+    assert any("was damaged on disk" in event.message for event in said if isinstance(event, Warned))
+    xr.testing.assert_equal(found, stage_of(*args, tmp_path / "b.zarr", *more, lambda: None))
+
+
+def test_a_conversion_that_is_to_overwrite_replaces_a_damaged_movie(source, tmp_path):
+    movie = convert(source, tmp_path / "m.zarr", settings=SMALL)
+    whole = files(movie)
+    for name in ("zarr.json", "0/zarr.json"):
+        (movie / name).write_bytes(b"\xff")
+        assert not stores.is_sound(movie)
+        convert(source, movie, settings=SMALL, overwrite=True)
+        assert files(movie) == whole
+        assert stores.is_sound(movie)
+
+
+@pytest.mark.parametrize(("worker", "sees"), [("tls://127.0.0.1:4", 2), ("tls://10.0.0.7:4", 5)])
+def test_shards_that_are_not_to_be_seen_are_waited_for_aloud(tmp_path, monkeypatch, worker, sees):
+    journal, shards, waits, said = Journal(tmp_path / "j", "key"), split(10, 5), [], []
+    monkeypatch.setattr(tasks, "sleep", waits.append)
+    client: Any = SimpleNamespace(nthreads=lambda: {worker: 1})
+    lost = tasks._lost(journal, shards, lambda *_: None, client, said.append)
+    assert lost.tolist() == [0, 1]
+    assert len(waits) == sees
+    assert len(said) == (sees > 2)
+    assert all("2 shards are not to be seen" in text and "95 s" in text for text in said)
+    assert tasks._looks(None) == ()
+
+
+def harm(file: Path, confuse: Callable[[bytes], bytes] | None) -> None:
+    if confuse is None:
+        file.unlink()
+    else:
+        file.write_bytes(confuse(file.read_bytes()))
+
+
+def zeros(data: bytes) -> bytes:
+    return bytes(len(data))
+
+
+def files(store: Path) -> dict[str, bytes]:
+    found = {path.relative_to(store).as_posix(): path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    return {name: data for name, data in found.items() if name != "zarr.json"}

@@ -73,7 +73,7 @@ ALLOWED = {
     "cluster": {"dask_dashboard", "deaths", "dispatch", "errors", "settings", "forkserver", "slurm", "ssh", "tls"},
     "forkserver": set(),
     "preload": {"kernels", "lazy", "stages"},
-    "stages": STAGES,
+    "stages": STAGES | {"passes"},
     "verify": STORES | {"conversion", "locks", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},

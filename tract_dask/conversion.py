@@ -24,7 +24,7 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from . import disk, schema, stores
-from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError
+from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError, StoreError
 from .io import FrameSource, SourceMetadata, open_source
 from .io.source import Source, reading
 from .journal import Journal, Payload, journal_beside, remove_journal
@@ -97,7 +97,8 @@ def convert(
     n_frames, n_y, n_x = movie.shape
     announce = partial(StageStarted, STAGE, n_frames, frame_bytes=n_y * n_x * movie.dtype.itemsize)
 
-    if is_converted(path, movie, settings, source_settings):
+    replaces = overwrite and not stores.is_sound(path)
+    if not replaces and is_converted(path, movie, settings, source_settings):
         update_metadata(path, known, **_remembered(movie))
         remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
@@ -429,12 +430,20 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
 
     Where only samples of the source are compared, its files have to be as old as they were.
     """
-    present = stores.attributes(path)
+    try:
+        present = stores.attributes(path)
+    except StoreError:  # --overwrite replaces it
+        return False
     ours = stores.format_of(present) == stores.FORMAT  # shards of an older format do not go with ours
     if present.get("kind") != "movie" or present.get("key") != key or present.get("complete") or not ours:
         return False
     if stamps.total_bytes > WHOLE_BYTES and present.get("written") != stamps.written:
         on_event(Warned("the movie was written again since its conversion was interrupted, which begins anew"))
+        return False
+    try:
+        stores.check_nodes(path, present, AXES)
+    except StoreError as error:
+        on_event(Warned(f"{error.where} is damaged: the conversion, which was interrupted, begins anew"))
         return False
     return True
 

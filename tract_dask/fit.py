@@ -147,8 +147,13 @@ def fit_movie(
         results.calibrate(path, frame_times(movie), **_calibration(movie))
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
-    if about.get("key") != key:
+    goes_on = about.get("key") == key
+    if not goes_on:
         remove_journal(journal_beside(path))
+    elif damage := results.damage(path):
+        goes_on = False
+        on_event(Warned(f"{damage.where} is damaged: the store is made anew, with the fits that are done"))
+    if not goes_on:
         results.create(
             path,
             columns,

@@ -15,7 +15,14 @@ AXES = ("t", "y", "x")
 
 
 def describe(path: Path, ours: dict[str, Any]) -> None:
-    """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own."""
+    """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own.
+
+    Raises
+    ------
+    StoreError
+        Where metadata of the store are damaged; nothing is written then.
+    """
+    stores.check_nodes(path, ours, AXES)
     frame_time, pixel = ours["frame_time_s"], ours["pixel_size_pm"]
     for axis, length, step, units in (
         ("t", ours["shape"][0], frame_time, ("s", "frame")),

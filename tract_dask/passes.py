@@ -6,7 +6,7 @@ import io
 import tempfile
 import uuid
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,6 +24,10 @@ from .shard_files import checksum, unchecked
 from .shards import Shard
 from .stores import disk_errors, sole_parser
 from .tasks import run_shards
+
+
+class DamagedArrayError(StoreError):
+    """What a task left is damaged or gone: its shard is no longer done, and the same stage again makes it anew."""
 
 
 class Passes:
@@ -98,18 +102,20 @@ def load_saved(path: Path) -> NDArray[Any]:
 
     Raises
     ------
-    StoreError
-        Where it is missing, or damaged.
+    DamagedArrayError
+        Where it is missing, or damaged; it is then removed, so that no journal takes it for done.
     """
     try:
         data = unchecked(memoryview(path.read_bytes()))
     except (FileNotFoundError, ValueError) as error:
-        raise StoreError(
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        raise DamagedArrayError(
             "what a task of this stage left is missing, or damaged",
             str(path),
             "an array with its checksum",
             str(error),
-            "Remove this file if it is there, and run again: it is made anew",
+            "Run the same command again: it is made anew",
         ) from error
     with sole_parser():
         array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)

@@ -276,7 +276,8 @@ def run(
         check_output(outputs, opened, settings, overwrite=overwrite)
         with sole_run(outputs, patience_s):
             if overwrite:
-                clear_run(outputs, on_event, keep_edited=_keeps_columns(outputs, opened))
+                same = stores.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened)
+                clear_run(outputs, on_event, keep_edited=same)
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -620,6 +621,11 @@ def check_output(
         raise DestinationError(
             "this place holds something else", str(root), "a folder", "a file", "Choose another place"
         )
+    for path in outputs.written():
+        if path.suffix != ".zarr" and path.is_dir():
+            raise DestinationError(
+                "a folder lies where a file is written", str(path), "a file, or nothing", "a folder", "Move it away"
+            )
     others = sorted(path.name for path in root.glob("[!.]*"))
     if others and not ours and not overwrite:
         raise DestinationError(
@@ -632,14 +638,6 @@ def check_output(
     if not overwrite:
         _check_movie(outputs, source, settings)
     stores.check_destination(outputs.movie, overwrite=overwrite)
-
-
-def _keeps_columns(outputs: Outputs, source: FrameSource) -> bool:
-    """Tell whether edited columns outlive a run with --overwrite: where the movie is known to be the same."""
-    try:
-        return is_movie_of(outputs.movie, source)
-    except StoreError:
-        return False
 
 
 def _check_movie(outputs: Outputs, source: FrameSource, settings: RunSettings | None) -> None:

@@ -17,7 +17,7 @@ import xarray as xr
 import zarr
 
 from . import disk, schema, stores
-from .errors import MissingStoreError, SettingsError
+from .errors import MissingStoreError, SettingsError, StoreError
 from .journal import Journal, journal_beside
 from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
 from .schema import REJECTED, Status
@@ -38,6 +38,23 @@ _FILE_BYTES = 128 << 20
 
 _CHUNK_BYTES = 32 << 20
 """Stored chunks are opened in groups, of so many bytes of ``fit``: small ones would be a task each."""
+
+
+def damage(path: Path) -> StoreError | None:
+    """Return what is wrong with what :func:`create` has written; None where it is sound.
+
+    Raises
+    ------
+    StoreError
+        Where it cannot be read.
+    """
+    try:
+        stores.open_dataset(path, only=[name for name in stores.nodes(path) if name not in SHARDED])
+    except StoreError as error:
+        if stores.is_of_system(error):
+            raise
+        return error
+    return None
 
 
 def create(

@@ -28,6 +28,7 @@ from .io import FrameSource
 from .journal import journal_beside, remove_journal
 from .keyed import counted
 from .movie import Movie, open_movie
+from .passes import DamagedArrayError
 from .pixel_range import check_pixels
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
@@ -42,6 +43,9 @@ Workers = Callable[[], Client]
 Aside = Callable[[Callable[[], object]], object]
 """Takes work that nothing waits for but the end of the run."""
 
+
+_ATTEMPTS = 3
+"""So often a stage is gone through whose tasks left what is damaged then."""
 
 _OUR_TABLE = b"column_id,x,y,kind,"
 """How a table begins that a run has written."""
@@ -307,12 +311,21 @@ def _kept(
         if dataset.attrs.get("pixel_size_pm") == movie.pixel_size_pm:
             return dataset
     else:
-        journal = journal_beside(path)
-        dataset = make(journal)
+        dataset = _made(partial(make, journal_beside(path)), on_event)
     dataset.attrs["pixel_size_pm"] = movie.pixel_size_pm
     _save(dataset, path, key, settings, stage, source=str(movie.path))
     remove_journal(journal_beside(path))
     return dataset
+
+
+def _made(make: Callable[[], xr.Dataset], on_event: Sink) -> xr.Dataset:
+    """Return the result of a stage; what its tasks left and the disk has damaged since is made anew."""
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return make()
+        except DamagedArrayError as error:
+            on_event(Warned(f"{error.where} was damaged on disk: it is made anew"))
+    return make()
 
 
 def _save(dataset: xr.Dataset, path: Path, key: str, settings: Settings, kind: str, **more: Any) -> None:
@@ -374,6 +387,8 @@ def put_away(csv: Path, on_event: Sink) -> None:
 
 def clear_columns(csv: Path, on_event: Sink, *, keep_edited: bool) -> None:
     """Remove what the columns stage has left at ``csv``; a table that was edited by hand is kept, or put away."""
+    if not stores.is_sound(csv.with_suffix(".zarr")):
+        stores.remove(csv.with_suffix(".zarr"))
     before = _Table.read(csv, ColumnSettings())
     edited = before.is_changed or bool(before.content and not before.about)
     csv.with_suffix(".png").unlink(missing_ok=True)

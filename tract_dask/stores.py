@@ -115,6 +115,49 @@ def _is_marked(path: Path) -> bool:
     return any((path / name / METADATA).exists() for name in _MARKS)
 
 
+def is_sound(path: Path) -> bool:
+    """Tell whether the metadata of the store at ``path`` are as they were written; so they are where there is none.
+
+    Raises
+    ------
+    StoreError
+        Where they cannot be read, or a newer version of the package wrote them.
+    """
+    try:
+        check_nodes(path, attributes(path))
+    except StoreError as error:
+        if isinstance(error, MissingStoreError) or is_of_system(error):
+            raise
+        return False
+    return True
+
+
+def is_of_system(error: StoreError) -> bool:
+    """Tell whether the system did not give a file, which may be sound."""
+    return isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError)
+
+
+def check_nodes(path: Path, about: Mapping[str, Any], changing: Collection[str] = ()) -> None:
+    """Check that the metadata of all arrays and groups are those that were written.
+
+    Parameters
+    ----------
+    about
+        What the store at ``path`` says of itself.
+    changing
+        Nodes whose metadata may be others, since they are about to be written anew.
+
+    Raises
+    ------
+    StoreError
+        Where they are damaged or missing.
+    """
+    _check_nodes(path, about, [name for name in about.get("arrays", ()) if name not in changing])
+    for name in changing:
+        if not read_json(path / name / METADATA):
+            raise damaged(path / name / METADATA, "no such file", "is missing")
+
+
 def format_of(about: Mapping[str, Any]) -> int:
     """Return the number of a store's format, by its attributes; 1 for stores that have none."""
     number = about.get("format")
@@ -283,7 +326,9 @@ def write_arrays(dataset: xr.Dataset, path: Path) -> None:
 def overwrite_array(path: Path, values: NDArray[Any]) -> None:
     """Write all values of an array of a store anew."""
     with _configured(_WRITE_ALL):
-        zarr.open_array(path, mode="r+", zarr_format=3)[...] = values
+        with _opening(path):
+            array = zarr.open_array(path, mode="r+", zarr_format=3)
+        array[...] = values
 
 
 def open_dataset(path: Path, only: Collection[str] = ()) -> xr.Dataset:
@@ -328,7 +373,7 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
         Where its metadata are damaged.
     """
     about = attributes(path)
-    _check_nodes(path, about, about.get("arrays", ()))
+    check_nodes(path, about)
     whole = format_of(about) >= FORMAT and not partial
     try:
         with _configured(CHECKED if whole else {}), _opening(path):

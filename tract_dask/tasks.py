@@ -15,13 +15,17 @@ from .errors import StoreError
 from .journal import Journal, Payload
 from .progress import Sink, Warned, silent
 from .shards import Shard
-from .tries import Place, Trouble, is_hopeless, trouble, wait_s
+from .tries import Place, Trouble, host_of, is_hopeless, trouble, wait_s
 
 _ROUNDS = 3
 """So often shards are made that are not on disk afterwards."""
 
-_LOOK_AGAIN_S = (0.2, 1.0, 5.0, 30.0, 60.0)
-"""After such waits they are looked for again: network disks may show a file for so long as missing."""
+_LOOK_AGAIN_S = (0.2, 1.0)
+_FAR_LOOK_AGAIN_S = (5.0, 30.0, 60.0)
+"""After such waits they are looked for again; after more of them where workers are on other machines, whose files a
+network disk may show for so long as missing."""
+
+_HERE = ("127.0.0.1", "[::1]", "localhost")
 
 
 def _nothing(shard: Shard, payload: Payload) -> None:
@@ -70,7 +74,7 @@ def stream_shards(
 
     On a cluster, shards that take little time go out several at once: a task takes them one by one, and notes each in
     the journal, for about half a second. In the end every shard is looked at on disk, and made again where it is not
-    as the journal says.
+    as the journal says; that is said.
 
     Parameters
     ----------
@@ -89,7 +93,7 @@ def stream_shards(
     file
         What the shards are read from, to be named where an error names nothing.
     on_event
-        Takes warnings: of errors that may pass, and of workers that die or hang.
+        Takes warnings: of errors that may pass, of workers that die or hang, and of shards that are not on disk.
 
     Raises
     ------
@@ -114,9 +118,11 @@ def stream_shards(
         on_event(Warned(text))
 
     todo = _missing(journal, shards, take_once)
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         if not len(todo):
             return
+        if number:
+            tell(f"{_count(todo)} of stage {name} are not on disk as they were written: they are made again")
         if client is None:
             results = _run_here(work, todo, file, tell)
         else:
@@ -125,10 +131,10 @@ def stream_shards(
             for index, payload in finished:
                 take_once(index, payload)
                 on_done(shards[index], payload)
-        todo = _lost(journal, shards, take_once, patient=client is not None)
+        todo = _lost(journal, shards, take_once, client, tell)
     if len(todo):
         raise StoreError(
-            f"{len(todo)} shards of stage {name} were written, and are not on disk as they were written",
+            f"{_count(todo)} of stage {name} were written, and are not on disk as they were written",
             str(journal.folder.parent),
             "the files that the journal names",
             f"none, or others, for frames {shards[todo[0]].start} to {shards[todo[0]].stop - 1}",
@@ -145,18 +151,37 @@ def _missing(journal: Journal, shards: Sequence[Shard], take: Callable[[int, Pay
     return np.flatnonzero(missing)
 
 
-def _lost(journal: Journal, shards: Sequence[Shard], take: Callable[[int, Payload], None], *, patient: bool) -> Numbers:
+def _lost(
+    journal: Journal, shards: Sequence[Shard], take: Callable[[int, Payload], None], client: Client | None, tell: Tell
+) -> Numbers:
     """Return which shards are not on disk, though all were reported done.
 
     What another machine wrote can take a while to be seen on a network disk: a cluster's shards are looked for again.
     """
     lost = _missing(journal, shards, take)
-    for seconds in _LOOK_AGAIN_S if patient else ():
+    for number, seconds in enumerate(_looks(client)):
         if not len(lost):
             break
+        if number == len(_LOOK_AGAIN_S):
+            tell(
+                f"{_count(lost)} are not to be seen at {journal.folder.parent}, though they were written:"
+                f" they are looked for again for {sum(_FAR_LOOK_AGAIN_S):.0f} s"
+            )
         sleep(seconds)
         lost = _missing(journal, shards, take)
     return lost
+
+
+def _looks(client: Client | None) -> tuple[float, ...]:
+    """Return the waits before each further look, in s; the workers and this process see the same disk, or may not."""
+    if client is None:
+        return ()
+    far = {host_of(worker) for worker in client.nthreads()} - {*_HERE}
+    return (*_LOOK_AGAIN_S, *(_FAR_LOOK_AGAIN_S if far else ()))
+
+
+def _count(shards: Numbers) -> str:
+    return f"{len(shards)} shard{'s' if len(shards) != 1 else ''}"
 
 
 def _work(
