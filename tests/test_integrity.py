@@ -341,6 +341,16 @@ def test_overwrite_replaces_a_damaged_run(run, copy):
     assert not (copy / "columns.zarr").exists()
 
 
+def test_convert_with_overwrite_begins_anew_whatever_is_there(run, copy):
+    os.truncate(copy / "movie.zarr" / "0" / "c.1.0.0", 100)
+    with (
+        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+        pipeline.run_convert(run.parent / "movie.npy", copy / "movie.zarr", SETTINGS, client=client, overwrite=True)
+    assert arrays_of(copy / "movie.zarr") == arrays_of(run / "movie.zarr")
+
+
 def command(*args) -> tuple[int, str]:
     result = CliRunner().invoke(main, ["verify", *map(str, args)])
     return result.exit_code, result.stdout

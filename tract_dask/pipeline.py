@@ -294,6 +294,8 @@ def run_convert(
     settings, path = _absolute(settings or RunSettings()), Path(destination).absolute()
     with closing(_open(source, settings, None if overwrite else path)) as opened:
         plan = plan_run(opened.shape, opened.dtype, settings)
+        if overwrite and stores.is_sound(path) and stores.attributes(path).get("kind") == "movie":
+            stores.remove(path)  # also the very movie that would be made: a shard of it may be damaged
         with _Session(opened.path, path, settings.cluster, client, on_event, plan) as session:
             return convert_stage(opened, path, settings, session.workers, session.send, overwrite=overwrite)
 
