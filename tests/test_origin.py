@@ -152,6 +152,34 @@ def test_a_file_of_a_sequence_that_is_replaced_is_refused(tmp_path, number):
     assert caught.value.where == str(changed)
 
 
+LISTINGS = {
+    "added": (lambda folder: shutil.copy(folder / "frame_023.tif", folder / "frame_024.tif"), "25 files: frame_024"),
+    "taken away": (lambda folder: (folder / "frame_023.tif").unlink(), r"none"),
+    "renamed": (lambda folder: (folder / "frame_023.tif").rename(folder / "frame_999.tif"), r"none"),
+    "of another format": (lambda folder: np.save(folder / "dark.npy", FRAMES), "several formats"),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "pattern"), [*((change, "") for change in LISTINGS), ("added", "frame_*.tif"), ("renamed", "*.tif")]
+)
+def test_a_sequence_that_gains_or_loses_a_file_while_it_is_converted_is_refused(tmp_path, change, pattern):
+    folder, (act, message) = sequence(tmp_path / "frames", FRAMES), LISTINGS[change]
+    with pytest.raises(SourceError, match=message) as caught:
+        convert(folder / pattern, tmp_path / "m.zarr", settings=SMALL, on_event=after(8, lambda: act(folder)))
+    assert str(folder) in caught.value.where
+    assert not stores.attributes(tmp_path / "m.zarr").get("complete")
+
+
+def test_a_list_or_a_pattern_of_files_may_gain_others_beside_them(tmp_path):
+    folder = sequence(tmp_path / "frames", FRAMES)
+    for number, source in enumerate((open_source(sorted(folder.iterdir())), folder / "frame_*.tif")):
+        act = after(8, lambda: shutil.copy(folder / "frame_000.tif", folder / "other.tif"))
+        movie = convert(source, tmp_path / f"{number}.zarr", settings=SMALL, on_event=act)
+        assert open_movie(movie).n_frames == 24
+        (folder / "other.tif").unlink()
+
+
 def test_a_list_of_files_is_converted_and_repaired_in_its_order(tmp_path):
     order = [2, 0, 3, 1]
     for number in order:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from . import disk, schema, stores
 from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError, StoreError
-from .io import FrameSource, SourceMetadata, open_source
+from .io import FrameSource, SourceMetadata, files_named_now, open_source
 from .io.source import Source, reading
 from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
@@ -460,6 +460,7 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
     try:
         yield
         origin.stamps.check(source.files)
+        _check_names(source)
         if _content(source) != origin.content:
             raise changed(source.path, "what it held then", "something else")
     except ChangedSourceError:
@@ -472,6 +473,24 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
             _clear(path)
             raise
         raise
+
+
+def _check_names(source: FrameSource) -> None:
+    """Check that the folder or the pattern of a movie names the same files as when it was opened.
+
+    Raises
+    ------
+    ChangedSourceError
+        Naming a file that was added or taken away.
+    """
+    named = files_named_now(source)
+    if named is None or named[0] == named[1]:
+        return
+    before, now = (frozenset(files) for files in named)
+    differing = ((now - before, "added"), (before - now, "taken away"))
+    words = [f"{min(files).name} was {verb}" for files, verb in differing if files]
+    got = f"{len(now)} files: " + (", ".join(words) or "in another order")
+    raise changed(source.path, f"{len(before)} files", got)
 
 
 @dataclass(frozen=True)

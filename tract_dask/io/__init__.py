@@ -21,7 +21,7 @@ from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
-from .sequence import open_sequence
+from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
 
@@ -31,6 +31,7 @@ __all__ = [
     "FrameSource",
     "Permit",
     "SourceMetadata",
+    "files_named_now",
     "list_files",
     "open_cached",
     "open_source",
@@ -149,6 +150,23 @@ def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None)
     open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
     listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
     return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
+
+
+def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, ...]] | None:
+    """Return the files that a movie's folder or pattern named when it was opened, and those that it names now.
+
+    None for a movie of one file, or of a list of files.
+
+    Raises
+    ------
+    SourceError
+        Where a folder holds files of several formats now, or cannot be read.
+    """
+    if source.listed or not isinstance(source, SequenceSource):
+        return None
+    with reading(source.path):
+        found = list_files(source.path, Path(_split(source.path)[0]), READERS)
+    return source.parts, found.files if found else ()
 
 
 def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> Source:
