@@ -5,10 +5,11 @@ import csv
 import numpy as np
 import pytest
 import xarray as xr
+from click.testing import CliRunner
 from conftest import Scene
 from matplotlib.figure import Figure
 
-from tract_dask import compare_filters, convert, filter_frames, fit_columns, open_movie
+from tract_dask import cli, compare_filters, convert, filter_frames, fit_columns, open_movie
 from tract_dask.comparison import FILTERS, filtered_region, table_rows, table_text, wiener_shifts, write_table
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.filters import blur
@@ -96,6 +97,16 @@ def test_what_is_not_there_cannot_be_compared(lattice):
         compare_filters(movie, columns, frames=(3,))
     with pytest.raises(SettingsError, match="no such columns"):
         compare_filters(movie, columns, column_ids=(1, 999))
+
+
+def test_frames_that_are_not_there_are_refused_before_the_run(lattice, tmp_path):
+    _, movie, _ = lattice
+    np.save(tmp_path / "movie.npy", movie.read(0, 3))
+    arguments = ["compare-filters", str(tmp_path / "movie.npy"), str(tmp_path / "out"), "--frames", "3"]
+    answer = CliRunner().invoke(cli.main, arguments)
+    assert answer.exit_code == 2
+    assert "Expected 0 to 2; got 3" in answer.output
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_figure_shows_each_filter_and_profiles_of_all(lattice, compared, tmp_path):

@@ -12,7 +12,7 @@ GROUND = {"errors", "settings", "schema", "progress"}
 STORES = GROUND | {"damage", "disk", "journal", "keyed", "provenance", "shards", "stamps", "stores"}
 MOVIE = STORES | {"io", "movie", "kernels", "pixel_range", "processor"}
 STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
-RUN = STAGES | {"cluster", "dispatch", "stages", "pipeline", "tasks", "tls"}
+RUN = STAGES | {"cluster", "dispatch", "inputs", "stages", "pipeline", "tasks", "tls"}
 
 ALLOWED = {
     "errors": set(),
@@ -77,7 +77,8 @@ ALLOWED = {
     "verify": STORES | {"conversion", "locks", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},
-    "pipeline": STAGES | {"cluster", "locks", "report", "stages", "tls"},
+    "inputs": STAGES | {"cluster", "vacuum"},
+    "pipeline": STAGES | {"cluster", "inputs", "locks", "report", "stages", "tls"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "editor": RUN | {"service"},

@@ -330,17 +330,115 @@ def test_columns_need_a_table_and_do_not_replace_a_foreign_one(job, tmp_path):
     assert mine.read_text() == "x,y\n1,2\n"
 
 
-@pytest.mark.parametrize(
-    ("columns", "fit"), [({"method": "csv"}, {}), ({}, {"window_px": 20}), ({}, {"window_px": 301})]
-)
-def test_what_cannot_fit_the_movie_is_refused_before_any_work(job, tmp_path, columns, fit):
-    seeds = tmp_path / "seeds.csv"
-    seeds.write_text("x,y\n1000,20\n")
-    columns = columns | {"csv": str(seeds)} if columns else {}
-    with pytest.raises(SettingsError, match=r"outside the image|window cannot be used"):
-        job(change(columns=columns, fit=fit))
+AWAY = {"origin": [900, 900], "a": [940, 900], "a_count": 1, "b": [900, 940], "b_count": 1}
+
+UNFIT = {
+    "table": ({"columns": {"method": "csv", "csv": "seeds.csv"}}, "y from 0 to 159"),
+    "lattice": ({"columns": {"method": "lattice", "lattices": (AWAY,)}}, "from 0 to 143, 159"),
+    "template": ({"columns": {"method": "template", "template": (20, 160)}}, "y from 0 to 159"),
+    "template of one number": ({"columns": {"method": "template", "template": (20,)}}, "y from 0 to 159"),
+    "spacing": ({"columns": {"spacing_px": 161.0}}, "160 rows and 144 columns"),
+    "search radius": ({"columns": {"search_radius_px": 500.0}}, "160 rows and 144 columns"),
+    "centroid radius": ({"columns": {"centroid_radius_px": 500.0}}, "160 rows and 144 columns"),
+    "even window": ({"fit": {"window_px": 20}}, "to 144, the shorter side"),
+    "large window": ({"fit": {"window_px": 145}}, "to 144, the shorter side"),
+    "box below": ({"fit": {"vacuum_box": (100, 161, 0, 20)}}, "160 rows and 144 columns"),
+    "box to the right": ({"fit": {"vacuum_box": (0, 20, 100, 145)}}, "160 rows and 144 columns"),
+    "box above": ({"fit": {"vacuum_box": (-1, 20, 0, 20)}}, "160 rows and 144 columns"),
+    "no box": ({"fit": {"vacuum_box": (20, 0, 0, 20)}}, "y0 < y1"),
+    "box and drift": (
+        {"fit": {"vacuum_box": (0, 20, 0, 20)}, "drift": {"method": "csv", "csv": "drift.csv"}},
+        r"leaves frame 3, drifted by 0, -5 px",
+    ),
+    "drift of another movie": ({"drift": {"method": "csv", "csv": "short.csv"}}, "all 12 frames"),
+}
+
+
+@pytest.fixture
+def tables(job) -> Path:
+    """Small inputs that do not fit the movie, in its folder."""
+    (job.source.parent / "seeds.csv").write_text("x,y\n20,1000\n")
+    rows = [f"{frame},{-5 * (frame == 3)},0" for frame in range(12)]
+    (job.source.parent / "drift.csv").write_text("\n".join(["frame,y,x", *rows]))
+    (job.source.parent / "short.csv").write_text("\n".join(["frame,y,x", *rows[:11]]))
+    return job.source.parent
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_what_does_not_fit_the_movie_is_refused_before_any_work(job, tables, monkeypatch, name):
+    monkeypatch.chdir(tables)
+    changed, message = UNFIT[name]
+    for more in ({}, {"plan_only": True}):
+        with pytest.raises(InputError, match=message):
+            job(change(**changed), **more)
     assert job.events == []
     assert not job.output.exists()
+
+
+@pytest.mark.parametrize("name", sorted(UNFIT.keys() - {"box and drift"}))
+def test_what_does_not_fit_the_movie_is_refused_by_single_stages(base, tables, monkeypatch, tmp_path, name):
+    monkeypatch.chdir(tables)
+    movie, drift = base.output / "movie.zarr", base.output / "drift.zarr"
+    (changed, message), events = UNFIT[name], []
+    stages = {
+        "drift": lambda how: pipeline.run_drift(movie, tmp_path / "d.zarr", how, on_event=events.append),
+        "columns": lambda how: pipeline.run_columns(movie, tmp_path / "c.csv", how, drift, on_event=events.append),
+        "fit": lambda how: pipeline.run_fit(
+            movie, base.output / "columns.csv", tmp_path / "r.zarr", how, drift, on_event=events.append
+        ),
+    }
+    stage = next(stage for stage in ("drift", "columns", "fit") if stage in changed)
+    with pytest.raises(InputError, match=message):
+        stages[stage](change(**changed))
+    assert events == []
+    assert not list(tmp_path.glob("*.zarr"))
+
+
+@pytest.mark.parametrize(
+    ("table", "box", "message"),
+    [("seeds.csv", None, "y from 0 to 159"), ("", (0, 160, 0, 20), r"leaves frame \d+, drifted")],
+)
+def test_the_fit_alone_holds_table_and_box_against_the_frame(base, tables, tmp_path, table, box, message):
+    given = tables / table if box is None else base.output / "columns.csv"
+    movie, drift, events = base.output / "movie.zarr", base.output / "drift.zarr", []
+    with pytest.raises(SettingsError, match=message):
+        pipeline.run_fit(
+            movie, given, tmp_path / "r.zarr", change(fit={"vacuum_box": box}), drift, on_event=events.append
+        )
+    assert events == []
+
+
+def test_a_box_that_the_drift_takes_out_is_refused_before_the_sum(job):
+    with pytest.raises(SettingsError, match=r"leaves frame \d+, drifted by"):
+        job(change(fit={"vacuum_box": (0, 160, 0, 144)}))
+    assert job.worked == {"convert", "drift"}
+
+
+def test_pixels_that_are_no_counts_are_refused_right_after_the_conversion(scene, npy, tmp_path, client):
+    job = Job(npy(scene.counts().astype("i4") - 1000), tmp_path / "out", client)
+    with pytest.raises(SettingsError, match="negative"):
+        job(change(fit={"estimator": "poisson"}))
+    assert job.worked == {"convert"}
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (b"x,y\n20,1000\n", "y from 0 to 159"),
+        (b"column_id,x,y\n1,20,20\n1,60,60\n", "comes twice"),
+        (b"x,y\n20,nan\n", "y cannot be read"),
+        (b"x,y\n20,20\n\xff", "cannot be read"),
+        (b"x;y\n20;20\n", "does not say where"),
+        (b"\n", "is empty"),
+    ],
+)
+def test_a_table_that_was_edited_wrongly_is_refused_before_any_work(done, table, message):
+    (done.output / "columns.csv").write_bytes(table)
+    with pytest.raises(SettingsError, match=message) as caught:
+        done(change(drift={"search_px": 7.0}))
+    assert "columns.csv" in caught.value.where
+    assert done.events == []
+    assert (done.output / "columns.csv").read_bytes() == table
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EMFILE])

@@ -87,6 +87,12 @@ DEEP: dict = {"columns": {"lattices": [{"a": [[[[[1]]]]]}]}}
         ({"source": "movie.npy", "output": ".tract_dask/x"}, 403, ["service's own"]),
         ({"source": "movie.npy", "settings": {"fit": {"window_px": 8}}}, 400, ["window_px", "odd", "8"]),
         ({"source": "movie.npy", "settings": {"fit": {"window_px": 401}}}, 400, ["window_px"]),
+        ({"source": "movie.npy", "settings": {"fit": {"vacuum_box": [0, 9999, 0, 9]}}}, 400, ["vacuum_box", "rows"]),
+        (
+            {"source": "movie.npy", "settings": {"columns": {"method": "template", "template": [9999, 0]}}},
+            400,
+            ["template", "x from 0"],
+        ),
         ({"source": "movie.npy", "settings": {"fit": {"threshold": "high"}}}, 400, ["threshold", "float"]),
         ({"source": "movie.npy", "settings": {"fit": {"nothing": 1}}}, 400, ["no setting 'nothing'"]),
         ({"source": "movie.npy", "settings": {"cluster": {"scheduler": "tcp://x:1"}}}, 400, ["cluster"]),

@@ -253,9 +253,10 @@ def compare_filters(
 
     run_folder = Path(source)
     if not (run_folder / "movie.zarr").is_dir():
-        run_folder = output
+        run_folder, pipeline = output, _pipeline(settings)
+        comparison.check_frames(frames, pipeline.run(source, output, settings, plan_only=True).frames)
         with _progress() as on_event:
-            _pipeline(settings).run(source, output, settings, on_event=on_event)
+            pipeline.run(source, output, settings, on_event=on_event)
     compared, warnings = comparison.compare_in_run(run_folder, output, frames, column_ids, settings.fit)
     if as_json:
         click.echo(json.dumps({"rows": list(comparison.table_rows(compared)), "warnings": warnings}))

@@ -19,7 +19,15 @@ from .kernels.magnitude import unit_of
 from .kernels.peaks import centroids, climb
 from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .schema import Status
-from .seeds import column_dataset, lattice_columns, positions, read_columns_csv, settings_lattices, write_columns_csv
+from .seeds import (
+    check_inside,
+    column_dataset,
+    lattice_columns,
+    lattice_sites,
+    positions,
+    read_columns_csv,
+    write_columns_csv,
+)
 from .settings import ColumnSettings
 from .windows import check_window, default_window, neighbour_distance
 
@@ -248,47 +256,12 @@ def _lattice_of(scene: _Scene, settings: ColumnSettings) -> Lattice:
 
 def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
     """Return the sites of all lattices inside the image; a site that two lattices share belongs to the first."""
-    lattices = settings_lattices(settings.lattices)
-    places = np.concatenate([positions(lattice) for lattice in lattices])
-    kind = np.concatenate([lattice["kind"].to_numpy() for lattice in lattices])
-    size = np.array(scene.valid.shape[::-1])
-    inside = ((places >= -0.5) & (places < size - 0.5)).all(axis=1)
-    if not inside.any():
-        raise SettingsError(
-            "no site of the lattices is inside the image",
-            "setting lattices (ColumnSettings)",
-            f"positions (x, y) from 0 to {size[0] - 1}, {size[1] - 1}",
-            f"the first at ({places[0, 0]:g}, {places[0, 1]:g})",
-            "Give positions in px of the summed image, x to the right and y down",
-        )
-    seeds = _Seeds(places[inside], kind[inside], np.arange(1, inside.sum() + 1), False)
-    finest = settings.spacing_px or min(lattice.attrs["spacing_px"] for lattice in lattices)
+    sites = lattice_sites(settings.lattices, scene.valid.shape)
+    seeds = _Seeds(positions(sites), schema.texts(sites["kind"].to_numpy()), sites["column_id"].to_numpy(), False)
+    finest = settings.spacing_px or sites.attrs["spacing_px"]
     shared = _twins(seeds.places, _SAME * finest)
     distinct = np.delete(seeds.places, list(shared), axis=0)
     return seeds, settings.spacing_px or neighbour_distance(distinct) or finest
-
-
-def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> None:
-    """Check that the columns lie inside an image of ``shape`` (y, x).
-
-    Raises
-    ------
-    SettingsError
-        With their number, and the first that does not.
-    """
-    size, places = np.array(shape[::-1]), positions(columns)
-    outside = np.flatnonzero(~((places >= -0.5) & (places < size - 0.5)).all(axis=1))
-    if len(outside):
-        first = int(outside[0])
-        x, y = places[first]
-        raise SettingsError(
-            f"{len(outside)} of {len(places)} columns lie outside the image",
-            where,
-            f"x from 0 to {size[0] - 1}, y from 0 to {size[1] - 1}",
-            f"column {columns['column_id'].to_numpy()[first]} at x {x:g}, y {y:g}"
-            + (" first" if len(outside) > 1 else ""),
-            "Give positions in px of the summed image (check that x and y are not exchanged), or remove these columns",
-        )
 
 
 def _corners(places: Places, window: int, valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

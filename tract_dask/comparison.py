@@ -83,7 +83,7 @@ def compare_filters(
     known = columns["column_id"].to_numpy().tolist()
     chosen = known if column_ids is None else list(column_ids)
     _check_known("columns", chosen, known, f"{known[0]} to {known[-1]}" if known else "none")
-    _check_known("frames", frames, range(movie.n_frames), f"0 to {movie.n_frames - 1}")
+    check_frames(frames, movie.n_frames)
     settings = dataclasses.replace(settings or FitSettings(), estimator="lsq", shape="free")
     parts = []
     for name in FILTERS:
@@ -99,6 +99,17 @@ def compare_filters(
     compared["intensity_difference"] = change.assign_attrs(units="%")
     compared.attrs = {"pixel_size_pm": movie.pixel_size_pm, "window_px": job.window}
     return compared
+
+
+def check_frames(frames: Sequence[int], n_frames: int) -> None:
+    """Check that a movie of ``n_frames`` has the frames.
+
+    Raises
+    ------
+    SettingsError
+        Naming those that it has not.
+    """
+    _check_known("frames", frames, range(n_frames), f"0 to {n_frames - 1}")
 
 
 def _check_known(what: str, wanted: Sequence[int], known: Sequence[int], expected: str) -> None:

@@ -26,10 +26,10 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 
 from . import schema, stores
-from .columns import check_inside, find_columns
+from .columns import find_columns
 from .pipeline import Outputs, sum_beside
 from .provenance import provenance
-from .seeds import columns_csv, parse_columns_csv, read_columns_csv
+from .seeds import check_inside, columns_csv, parse_columns_csv, read_columns_csv
 from .service import problems
 from .service.api import columns as columns_api
 from .service.api import previews

@@ -238,13 +238,13 @@ def prepare(
     check_pixels(statistics, str(movie.path))
     bad = statistics["frame_bad_pixels"].to_numpy() > 0
     if settings.estimator == "poisson":
-        _check_counts(statistics["frame_min"].to_numpy())
+        check_counts(statistics["frame_min"].to_numpy())
     blur = columns.attrs.get("blur_sigma_px", settings.blur_sigma_px)
     refine = refine_columns if drift is not None else None
     return Job(_reference(columns, blur, settings), shift, bad, window, box, refine, settings)
 
 
-def _check_counts(smallest: Floats) -> None:
+def check_counts(smallest: Floats) -> None:
     """Check that the smallest pixels of the frames can be counts.
 
     Raises

@@ -20,9 +20,9 @@ from distributed import Client
 from . import stores
 from .cluster import LazyClient, local_memory_limit, memory_budget
 from .conversion import check_kept, is_movie_of, remembered_source
-from .drift import read_drift_csv
 from .errors import ClusterError, DestinationError, InputError, SourceError, StoreError
 from .fit import FitSummary
+from .inputs import check_columns, check_drift, check_fit, check_inputs, check_pixels_of
 from .io import FileList, FrameSource, Permit, open_source
 from .journal import journal_beside, remove_journal
 from .layout import peak_memory, plan_layout
@@ -42,12 +42,11 @@ from .progress import (
     silent,
     tee,
 )
-from .seeds import read_columns_csv, settings_lattices
+from .schema import drift_of
 from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import split
-from .stages import clear_columns, columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
+from .stages import check_edited, clear_columns, columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
 from .tls import open_to_others
-from .windows import check_window
 
 WORKER_BYTES = 300_000_000
 """What a worker process takes before it has read a pixel."""
@@ -269,7 +268,7 @@ def run(
     outputs = Outputs(Path(output).absolute())
     _check_stage(until)
     with closing(_open(source, settings, None if overwrite else outputs.movie, permit)) as opened:
-        check_inputs(opened, settings)
+        check_inputs(opened.shape, settings)
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
             return RunOutcome(outputs, plan, "planned", plan.frames)
@@ -278,6 +277,7 @@ def run(
             if overwrite:
                 same = stores.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened)
                 clear_run(outputs, on_event, keep_edited=same)
+            check_edited(outputs.columns, settings.columns, opened.shape[1:])
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -310,6 +310,7 @@ def run_drift(
 ) -> xr.Dataset:
     """Measure the drift of a movie store into the store ``output``."""
     settings, path, opened = _absolute(settings or RunSettings()), Path(output).absolute(), open_movie(movie)
+    check_drift(opened.n_frames, settings.drift)
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
         return drift_stage(opened, path, settings.drift, session.workers, session.send)
 
@@ -327,6 +328,8 @@ def run_columns(
     """Find the columns of a movie store into the table ``output`` (.csv); the summed image is kept beside it."""
     settings, path, opened = _absolute(settings or RunSettings()), Path(output).absolute(), open_movie(movie)
     _check_suffix(path, ".csv")
+    check_columns(opened.shape[1:], settings.columns, settings.fit.window_px)
+    check_edited(path, settings.columns, opened.shape[1:])
     shift = None if drift is None else stores.open_dataset(Path(drift))
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
         summed = sum_stage(opened, shift, sum_beside(path), session.workers, session.send)
@@ -349,7 +352,9 @@ def run_fit(
     stores.check_destination(path)
     shift = None if drift is None else stores.open_dataset(Path(drift))
     chosen = dataclasses.replace(settings.columns, method="csv", csv=str(table))
-    read_columns_csv(table)
+    check_columns(opened.shape[1:], chosen, settings.fit.window_px)
+    check_fit(opened.shape[1:], settings.fit, drift_of(shift, opened.n_frames))
+    check_pixels_of(opened, settings.fit)
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
         summed = sum_stage(opened, shift, sum_beside(path), session.workers, session.send)
         found = columns_stage(summed, path.with_name(f"{path.stem}_columns.csv"), chosen, settings.fit, session.send)
@@ -417,8 +422,10 @@ def _stages(
     """Run the stages one by one; yield the name of each when it is done."""
     workers, send = session.workers, session.send
     made.movie = movie = convert_stage(source, outputs.movie, settings, workers, send)
+    check_pixels_of(movie, settings.fit)
     yield "convert"
     drift = drift_stage(movie, outputs.drift, settings.drift, workers, send)
+    check_fit(movie.shape[1:], settings.fit, drift["drift"].to_numpy())
     yield "drift"
     summed = sum_stage(movie, drift, outputs.sum, workers, send)
     yield "sum"
@@ -578,31 +585,9 @@ def _absolute(settings: RunSettings) -> RunSettings:
     )
 
 
-def check_inputs(source: FrameSource, settings: RunSettings) -> None:
-    """Read the small inputs once, so that a fault in them is found before any work."""
-    if settings.drift.method == "csv":
-        read_drift_csv(_required(settings.drift.csv, "--drift-csv"), source.shape[0])
-    if settings.columns.method == "csv":
-        from .columns import check_inside
-
-        table = _required(settings.columns.csv, "--columns")
-        check_inside(read_columns_csv(table), source.shape[1:], str(table))
-    if settings.columns.method == "lattice":
-        settings_lattices(settings.columns.lattices)
-    if settings.fit.window_px is not None:
-        check_window(settings.fit.window_px, source.shape[1:])
-    local_memory_limit(settings.cluster)
-
-
 def _check_stage(until: str | None) -> None:
     if until is not None and until not in STAGES:
         raise InputError("there is no such stage", "until", f"one of {', '.join(STAGES)}", until, "Correct its name")
-
-
-def _required(path: str | None, option: str) -> Path:
-    if path is None:
-        raise InputError("method csv needs a file", "settings", option, "none", f"Give one with {option}")
-    return Path(path)
 
 
 def check_output(

@@ -210,6 +210,63 @@ def settings_lattices(lattices: Sequence[Any]) -> list[xr.Dataset]:
     return found
 
 
+def lattice_sites(lattices: Sequence[Any], shape: tuple[int, ...]) -> xr.Dataset:
+    """Return the sites of all lattices of the settings inside an image of ``shape`` (y, x), lattice by lattice.
+
+    The attribute ``spacing_px`` is the shortest of the lattices.
+
+    Raises
+    ------
+    SettingsError
+        As :func:`settings_lattices`, and where no site is inside.
+    """
+    found = settings_lattices(lattices)
+    places = np.concatenate([positions(lattice) for lattice in found])
+    kind = np.concatenate([lattice["kind"].to_numpy() for lattice in found])
+    inside = _inside(places, shape)
+    if not inside.any():
+        raise SettingsError(
+            "no site of the lattices is inside the image",
+            "setting lattices (ColumnSettings)",
+            f"positions (x, y) from 0 to {shape[1] - 1}, {shape[0] - 1}",
+            f"the first at ({places[0, 0]:g}, {places[0, 1]:g})",
+            "Give positions in px of the summed image, x to the right and y down",
+        )
+    sites = column_dataset(places[inside], kind[inside].tolist())
+    sites.attrs["spacing_px"] = min(lattice.attrs["spacing_px"] for lattice in found)
+    return sites
+
+
+def _inside(places: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Tell which places (n, 2) of (x, y) lie on pixels of an image of ``shape`` (y, x)."""
+    on_pixels = (places >= -0.5) & (places < np.array(shape[::-1]) - 0.5)
+    inside: NDArray[np.bool_] = np.all(on_pixels, axis=1)
+    return inside
+
+
+def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> None:
+    """Check that the columns lie inside an image of ``shape`` (y, x).
+
+    Raises
+    ------
+    SettingsError
+        With their number, and the first that does not.
+    """
+    places = positions(columns)
+    outside = np.flatnonzero(~_inside(places, shape))
+    if len(outside):
+        first = int(outside[0])
+        x, y = places[first]
+        raise SettingsError(
+            f"{len(outside)} of {len(places)} columns lie outside the image",
+            where,
+            f"x from 0 to {shape[1] - 1}, y from 0 to {shape[0] - 1}",
+            f"column {columns['column_id'].to_numpy()[first]} at x {x:g}, y {y:g}"
+            + (" first" if len(outside) > 1 else ""),
+            "Give positions in px of the summed image (check that x and y are not exchanged), or remove these columns",
+        )
+
+
 def columns_csv(columns: xr.Dataset) -> str:
     """Return columns as CSV: column_id, x, y, kind, the fit's other parameters, and the flags by name.
 

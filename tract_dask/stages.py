@@ -33,7 +33,7 @@ from .pixel_range import check_pixels
 from .progress import Sink, StageDone, StageStarted, Warned, silent
 from .provenance import provenance, stage_key
 from .schema import Status
-from .seeds import write_columns_csv
+from .seeds import check_inside, read_columns_csv, write_columns_csv
 from .settings import ColumnSettings, DriftSettings, FitSettings, RunSettings, Settings
 from .summing import sum_image
 
@@ -171,6 +171,18 @@ def columns_stage(
     aside(partial(_draw, summed, found.copy(), figure))
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
     return found
+
+
+def check_edited(csv: Path, settings: ColumnSettings, shape: tuple[int, ...]) -> None:
+    """Check a table that was edited by hand, from which :func:`columns_stage` will start in images of ``shape`` (y, x).
+
+    Raises
+    ------
+    SettingsError
+        Where it cannot be read, or columns lie outside the image.
+    """
+    if _Table.read(csv, settings).is_edited:
+        check_inside(read_columns_csv(csv), shape, str(csv))
 
 
 def _columns_key(summed: xr.Dataset, counts: dict[str, Any], seeds: bytes) -> str:

@@ -69,6 +69,11 @@ def check_box(
 ) -> None:
     """Check that a vacuum box stays inside the frame whatever the drift; ``where`` is what an error names.
 
+    Parameters
+    ----------
+    drift
+        (frames, 2) in px; one row of zeros where it is not known yet.
+
     Raises
     ------
     SettingsError
@@ -88,7 +93,9 @@ def check_box(
     if not inside.all():
         frame = int(np.argmin(inside))
         raise SettingsError(
-            f"the vacuum box leaves frame {frame}, drifted by {shift[frame, 1]}, {shift[frame, 0]} px in x, y",
+            f"the vacuum box leaves frame {frame}, drifted by {shift[frame, 1]}, {shift[frame, 0]} px in x, y"
+            if shift[frame].any()
+            else "the vacuum box leaves the frame",
             where,
             f"a box inside {shape[0]} rows and {shape[1]} columns in every frame",
             str(box),

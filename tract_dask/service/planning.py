@@ -17,9 +17,10 @@ from starlette.datastructures import State as AppState
 
 from ..cluster import local_memory_limit, memory_limit
 from ..errors import ClusterError, SettingsError, TractError
+from ..inputs import check_inputs
 from ..io import FileList, Permit, open_source
 from ..movie import open_movie
-from ..pipeline import Outputs, Plan, check_inputs, check_output, plan_run
+from ..pipeline import Outputs, Plan, check_output, plan_run
 from ..progress import STAGES
 from ..settings import RunSettings, SourceSettings, from_dict, to_dict
 from .folders import DataRoot
@@ -206,7 +207,7 @@ def check_source(place: str | FileList, settings: RunSettings, folder: Path | No
     Its first frame is read as well, unless that is very large: some files crash their reader only then.
     """
     with closing(open_source(place, settings.source, settings.metadata, permit=permit)) as source:
-        check_inputs(source, settings)
+        check_inputs(source.shape, settings)
         if folder is not None and folder.exists():
             check_output(Outputs(folder), source, settings, overwrite=False)
         if _raw_bytes((1, *source.shape[1:]), source.dtype.name) <= _TRIED_BYTES:

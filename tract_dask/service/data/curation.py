@@ -21,10 +21,18 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ... import stores
-from ...columns import check_inside, find_columns, lattice_columns
+from ...columns import find_columns, lattice_columns
 from ...errors import MissingStoreError, SettingsError
 from ...schema import AMPLITUDE, SIGMA_A, SIGMA_B
-from ...seeds import check_sites, column_dataset, columns_csv, flag_names, parse_columns_csv, positions
+from ...seeds import (
+    check_inside,
+    check_sites,
+    column_dataset,
+    columns_csv,
+    flag_names,
+    parse_columns_csv,
+    positions,
+)
 from ...settings import ColumnSettings, RunSettings, from_toml, to_toml
 from ...windows import default_window, neighbour_distance
 
