@@ -389,6 +389,82 @@ def test_verify_names_what_is_wrong_and_repairs_the_movie(run, copy):
     assert read(movie) == read(run / "movie.zarr")
 
 
+def test_verify_is_silent_about_what_people_and_kills_do(copy):
+    table, events = copy / "columns.csv", copy / "events.jsonl"
+    assert verify(copy).notes == ()
+    lines = table.read_text().splitlines()
+    table.write_text("\ufeff" + "\r\n".join(lines[:-1]))
+    events.write_bytes(events.read_bytes()[:-9])
+    found = verify(copy)
+    assert found.sound
+    assert found.remedies == []
+    assert [f"the {len(lines) - 2} columns in it" in note or "not whole" in note for note in found.notes] == [
+        True,
+        True,
+    ]
+    (copy / "columns.png").unlink()
+    assert verify(copy).sound
+    assert verify(copy / "movie.zarr").notes == ()
+
+
+def test_verify_compares_the_settings_of_the_stores(run, copy):
+    before = (copy / "run.toml").read_text()
+    changed = before.replace("threshold = 1.6", "threshold = 2.5").replace('codec = "lz4"', 'codec = "zstd"')
+    (copy / "run.toml").write_text(changed.replace("shard_mb = 1.0", "shard_mb = 1.5"))
+    (note,) = verify(copy).notes
+    assert "movie.zarr (convert.codec); results.zarr (fit.threshold)" in note
+
+
+BESIDE = {
+    "run.toml garbled": (
+        "run.toml",
+        lambda data: data[:100] + b"\xff\x00" + data[100:],
+        "damaged",
+        "writes the file anew",
+    ),
+    "run.toml gone": ("run.toml", None, "missing", "writes the file anew"),
+    "a setting unknown": ("run.toml", lambda data: data.replace(b"threshold", b"thresold"), "damaged", "anew"),
+    "columns.csv cut": (
+        "columns.csv",
+        lambda data: data[: data.index(b"\n", 200) + 5],
+        "damaged",
+        "columns.csv, or remove",
+    ),
+    "columns.csv empty": ("columns.csv", lambda data: b"", "damaged", "columns.csv, or remove"),
+    "columns.csv gone": ("columns.csv", None, "missing", "columns are found anew"),
+    "figure flipped": ("columns.png", lambda data: data[:-30] + b"\0" * 3 + data[-27:], "damaged", "Remove"),
+    "figure cut": ("columns.png", lambda data: data[:-12], "damaged", "Remove"),
+    "report cut": ("report.html", lambda data: b"<html><body>", "damaged", "tract-dask report"),
+}
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_verify_names_small_files_that_cannot_be_used(copy, name):
+    file, garble, what, advice = BESIDE[name]
+    place = copy / file
+    if garble is None:
+        place.unlink()
+    else:
+        place.write_bytes(garble(place.read_bytes() if place.exists() else b""))
+    (fault,) = (found := verify(copy)).faults
+    assert (fault.file, fault.store, fault.what) == (place, copy, what)
+    assert not found.sound
+    assert advice in found.remedies[0]
+    assert command(copy)[0] == 1
+
+
+@pytest.mark.parametrize("name", ["run.toml", "columns.csv"])
+def test_a_small_file_that_is_mended_as_advised_is_sound(run, copy, name):
+    (copy / name).unlink()
+    with (
+        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+        pipeline.run(run.parent / "movie.npy", copy, SETTINGS, client=client, report=False)
+    assert verify(copy).sound
+    assert (copy / name).read_bytes() == (run / name).read_bytes()
+
+
 def test_repair_refuses_another_source(run, copy, tmp_path):
     (copy / "movie.zarr" / "0" / "c.0.0.0").unlink()
     stores.update_attributes(copy / "movie.zarr", source=str(tmp_path / "other.npy"))

@@ -15,9 +15,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from . import stores
+from .beside import Beside, look_beside
 from .conversion import remake
-from .damage import FRAME_AXES, METADATA, remedy
+from .damage import FRAME_AXES, METADATA
 from .errors import MissingStoreError, StoreError
+from .faults import Fault
 from .journal import Journal, entries, journal_beside
 from .locks import sole_use
 from .parts import SHARDED, Parts, layout
@@ -35,37 +37,6 @@ _STAGES = {"movie": "convert", "results": "fit"}
 
 
 @dataclass(frozen=True)
-class Fault:
-    """What is wrong with a file.
-
-    Attributes
-    ----------
-    stage
-        The one that wrote it.
-    what
-        ``damaged``, ``missing``, ``unreadable`` (by an error of the system) or ``left over``: no part of the store, as
-        a writer that was killed leaves it, which does no harm.
-    frames
-        The first frame in it and the one behind the last; None where it has none.
-    """
-
-    file: Path
-    store: Path
-    stage: str
-    what: str
-    why: str
-    frames: tuple[int, int] | None = None
-
-    def __str__(self) -> str:
-        frames = f", frames {self.frames[0]} to {self.frames[1] - 1}" if self.frames else ""
-        return f"{self.file}: {self.what}{frames} ({self.why})"
-
-    def to_record(self) -> dict[str, Any]:
-        """Return it as a mapping for JSON."""
-        return dataclasses.asdict(self) | {"file": str(self.file), "store": str(self.store)}
-
-
-@dataclass(frozen=True)
 class Verified:
     """What :func:`verify` found.
 
@@ -77,12 +48,15 @@ class Verified:
         Stores whose stage is not finished; what is missing there is no fault.
     without_checksums
         Stores of an older format, of which damage cannot be told.
+    notes
+        Sentences on what is no fault, such as a table that was edited.
     """
 
     faults: tuple[Fault, ...]
     files: int
     unfinished: tuple[Path, ...]
     without_checksums: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -92,8 +66,8 @@ class Verified:
     @property
     def remedies(self) -> list[str]:
         """What to do, a sentence for each store, or file, that needs it."""
-        found = [remedy(fault.file) for fault in self.faults if fault.what in ("damaged", "missing")]
-        found += [f"Remove {fault.file}" for fault in self.faults if fault.what == "left over"]
+        kinds = (("damaged", "missing"), ("left over",))
+        found = [fault.remedy for kind in kinds for fault in self.faults if fault.what in kind]
         unreadable = [fault.file for fault in self.faults if fault.what == "unreadable"]
         found += [f"Mend the disk or the permissions of {unreadable[0]}"] if unreadable else []
         return list(dict.fromkeys(found))
@@ -103,6 +77,7 @@ class Verified:
         lines = [*map(str, self.faults), *(f"{sentence}." for sentence in self.remedies)]
         lines += [f"{store}: unfinished; the same run again goes on with it" for store in self.unfinished]
         lines += [f"{store}: of an older format, without checksums" for store in self.without_checksums]
+        lines += self.notes
         bad = sum(fault.what != "left over" for fault in self.faults)
         return "\n".join([*lines, f"{self.files:,} files read: " + (f"{bad:,} are not sound" if bad else "all sound")])
 
@@ -115,23 +90,28 @@ class Verified:
             "remedies": self.remedies,
             "unfinished": list(map(str, self.unfinished)),
             "without_checksums": list(map(str, self.without_checksums)),
+            "notes": list(self.notes),
         }
 
 
 def verify(path: Path, on_event: Sink = silent) -> Verified:
-    """Read everything of a store, or of all stores of a run's folder, and check it.
+    """Read everything of a store, or of a run's folder with all stores and files in it, and check it.
 
     Raises
     ------
     MissingStoreError
         Where there is no store.
     """
-    found = [_verify_store(store, on_event) for store in stores_in(path)]
+    there = stores_in(path)
+    found = [_verify_store(store, on_event) for store in there]
+    alone = there == [path.absolute()]
+    beside = Beside((), (), 0) if alone else look_beside(path.absolute(), there)
     return Verified(
-        tuple(fault for one in found for fault in one.faults),
-        sum(one.files for one in found),
+        (*(fault for one in found for fault in one.faults), *beside.faults),
+        sum(one.files for one in found) + beside.files,
         tuple(store for one in found for store in one.unfinished),
         tuple(store for one in found for store in one.without_checksums),
+        beside.notes,
     )
 
 
