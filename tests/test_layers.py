@@ -76,7 +76,7 @@ ALLOWED = {
     "stages": STAGES | {"passes"},
     "faults": {"damage"},
     "beside": GROUND | {"faults", "keyed", "seeds", "small_files", "stores"},
-    "verify": STORES | {"beside", "conversion", "faults", "locks", "parts", "shard_files"},
+    "verify": STORES | {"beside", "conversion", "faults", "locks", "ome", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},
     "inputs": STAGES | {"cluster", "vacuum"},

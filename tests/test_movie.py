@@ -27,6 +27,7 @@ from tract_dask.progress import ShardDone, StageDone, StageStarted, Warned
 from tract_dask.settings import ConvertSettings, MetadataSettings
 from tract_dask.shard_files import ShardWriter
 from tract_dask.shards import split
+from tract_dask.verify import verify
 
 SMALL = ConvertSettings(shard_mb=1, tile_px=32)
 KNOWN = MetadataSettings(pixel_size_pm=8.0, frame_time_s=0.5, dose=125.0, gain=0.5)
@@ -357,6 +358,62 @@ def test_a_finished_conversion_is_reused_but_for_its_metadata(tmp_path, source):
     assert xr.open_zarr(path).t.attrs["units"] == "s"
     ome = zarr.open_group(path, mode="r").attrs["ome"]
     assert ome["multiscales"][0]["axes"][0]["unit"] == "second"
+
+
+def cut_off(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("size", [8.0, 9.0, None])
+@pytest.mark.parametrize("place", ["overwrite_array", "write_root"])
+def test_a_change_of_the_calibration_that_is_cut_off_is_ended_by_the_next_run(tmp_path, source, place, size):
+    path = convert(source, tmp_path / "movie.zarr", settings=SMALL, metadata=MetadataSettings(pixel_size_pm=8.0))
+    changed = MetadataSettings(pixel_size_pm=9.0)
+    real, calls = getattr(stores, place), []
+
+    def killed_at_the_last(*args, **more):
+        calls.append(args)
+        if len(calls) == {"overwrite_array": 3, "write_root": 2}[place]:
+            raise KeyboardInterrupt
+        return real(*args, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stores, place, killed_at_the_last)
+        with pytest.raises(KeyboardInterrupt):
+            convert(source, path, settings=SMALL, metadata=changed)
+    with pytest.raises(StoreError, match="was cut off"):
+        open_movie(path)
+    (fault,) = (found := verify(path)).faults
+    assert (fault.file, found.remedies) == (path / "zarr.json", ["Run the same command again"])
+    events = []
+    convert(source, path, settings=SMALL, metadata=MetadataSettings(pixel_size_pm=size), on_event=events.append)
+    assert events[-1].reused
+    movie, step = open_movie(path), size or 1.0
+    assert movie.pixel_size_pm == size
+    np.testing.assert_array_equal(movie.frames.y, np.arange(150) * step)
+    np.testing.assert_array_equal(movie.frames.x, np.arange(131) * step)
+    assert verify(path).sound
+    fresh = convert(source, tmp_path / "other.zarr", settings=SMALL, metadata=MetadataSettings(pixel_size_pm=size))
+    assert stores.attributes(path).keys() == stores.attributes(fresh).keys()
+
+
+@pytest.mark.parametrize("place", ["overwrite_array", "write_root"])
+def test_a_conversion_that_is_cut_off_at_its_metadata_ends_as_an_undisturbed_one(tmp_path, source, counts, place):
+    path, meta = tmp_path / "movie.zarr", MetadataSettings(pixel_size_pm=8.0)
+    act = stop_after(7)
+    with pytest.raises(Interrupted):
+        convert(source, path, settings=SMALL, metadata=meta, on_event=act)  # all shards are there
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stores, place, cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            convert(source, path, settings=SMALL, metadata=meta)
+    events = []
+    movie = open_movie(convert(source, path, settings=SMALL, metadata=meta, on_event=events.append))
+    assert not [event for event in events if isinstance(event, ShardDone)]
+    assert same_bits(movie.read(0, 21), counts)
+    np.testing.assert_array_equal(movie.frames.y, np.arange(150) * 8.0)
+    assert verify(path).sound
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["movie.npy", "movie.zarr"]
 
 
 def test_another_movie_is_replaced_only_when_told(tmp_path, source, counts):

@@ -31,7 +31,7 @@ from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .keyed import counted, default_of
 from .layout import LEVEL_DTYPE, Layout, disk_bytes, plan_layout
-from .ome import AXES, describe
+from .ome import AXES, CHANGING, describe
 from .progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from .provenance import ALGORITHMS, WHOLE_BYTES, digest_of, fingerprint, provenance, stage_key
 from .settings import ConvertSettings, MetadataSettings, SourceSettings, from_toml, to_toml
@@ -420,8 +420,10 @@ def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
         Where it cannot be written.
     """
     present, now = stores.attributes(path), _quantities(metadata) | more
-    if any(present.get(name) != value for name, value in now.items()):
+    cut_off = present.pop(CHANGING, False)
+    if cut_off or any(present.get(name) != value for name, value in now.items()):
         with stores.disk_errors(path):
+            stores.update_attributes(path, **{CHANGING: True})  # coordinates and root change one after the other
             describe(path, present | now)
 
 

@@ -20,7 +20,7 @@ from .damage import reading
 from .errors import MissingStoreError, StoreError
 from .journal import entries, journal_beside
 from .kernels.filters import Tiles
-from .ome import AXES
+from .ome import AXES, CHANGING
 from .shard_files import Grid, ShardReader, chunk_path, overlaps
 from .shards import Shard, Shards, split
 
@@ -35,6 +35,8 @@ def open_movie(path: str | Path) -> Movie:
     ------
     MissingStoreError
         Where there is none, or it is unfinished; with the number of shards that are missing.
+    StoreError
+        Where its metadata are damaged, or a change of them was cut off.
     """
     path = Path(path).absolute()
     present = stores.attributes(path)
@@ -54,6 +56,12 @@ def open_movie(path: str | Path) -> Movie:
             "all that this version knows of a movie",
             f"no {', '.join(lacking)}",
             "Convert the movie again",
+        )
+    if present.get(CHANGING):
+        raise StoreError(
+            "its pixel size or frame time is being changed, or that was cut off",
+            str(path),
+            remedy="Run the same command again",
         )
     shape = tuple(present["shape"])
     if not present["complete"]:

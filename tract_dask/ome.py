@@ -13,6 +13,9 @@ from .damage import METADATA, read_json
 
 AXES = ("t", "y", "x")
 
+CHANGING = "changing"
+"""Attribute that a movie has while its coordinates and its calibration are changed, and where that was cut off."""
+
 
 def describe(path: Path, ours: dict[str, Any]) -> None:
     """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own.

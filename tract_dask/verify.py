@@ -22,6 +22,7 @@ from .errors import MissingStoreError, StoreError
 from .faults import Fault
 from .journal import Journal, entries, journal_beside
 from .locks import sole_use
+from .ome import AXES, CHANGING
 from .parts import SHARDED, Parts, layout
 from .progress import ShardDone, Sink, StageDone, StageStarted, silent
 from .shard_files import ABSENT, read_index, unchecked
@@ -170,6 +171,10 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
     stage = _STAGES.get(str(about.get("kind")), str(about.get("kind", stage)))
     faults: list[Fault] = []
     arrays: list[_Array] = []
+    if about.get(CHANGING):
+        why = "its pixel size or frame time is being changed, or that was cut off"
+        faults.append(Fault(store / METADATA, store, stage, "damaged", why, help="Run the same command again"))
+        names = [name for name in names if name not in AXES]
     for name in names:
         try:
             arrays += _Array.of(store, name)
