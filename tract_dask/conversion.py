@@ -422,8 +422,9 @@ def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
     present, now = stores.attributes(path), _quantities(metadata) | more
     cut_off = present.pop(CHANGING, False)
     if cut_off or any(present.get(name) != value for name, value in now.items()):
+        mark: dict[str, Any] = {CHANGING: True}
         with stores.disk_errors(path):
-            stores.update_attributes(path, **{CHANGING: True})  # coordinates and root change one after the other
+            stores.update_attributes(path, **mark)  # coordinates and root change one after the other
             describe(path, present | now)
 
 
