@@ -276,6 +276,7 @@ def test_method_csv_needs_a_file():
         ("", r"line 1: column 'frame' is missing.*empty file"),
         ("frame,y,x\n0,1,1\n1,one,1\n", r"line 3: this is not a number.*'one'"),
         ("frame,y,x\n0,1\n", r"line 2: this is not a number.*None"),
+        ("frame,y,x\n0,1,5,2,5\n", r"line 2: there are more values.*3: frame, y, x"),
         ("frame,y,x\n0,1,nan\n", r"line 2: the drift is not finite"),
         ("frame,y,x\n0,1,1\n2,1,1\n", r"line 3: there is no such frame. Expected 0 to 1; got 2"),
         ("frame,y,x\n0.5,1,1\n", r"line 2: there is no such frame"),

@@ -16,7 +16,7 @@ from distributed import Client, LocalCluster
 
 from tract_dask import cluster, pipeline, settings, stores
 from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError, StoreError
-from tract_dask.progress import REPORT, STAGES, RunDone, RunStarted, StageDone, StageStarted, Warned
+from tract_dask.progress import REPORT, STAGES, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.results import open_results
 from tract_dask.settings import ConvertSettings, RunSettings
 
@@ -430,6 +430,8 @@ def test_pixels_that_are_no_counts_are_refused_right_after_the_conversion(scene,
         (b"x,y\n20,20\n\xff", "cannot be read"),
         (b"x;y\n20;20\n", "does not say where"),
         (b"\n", "is empty"),
+        (b"column_id,x,y\n1,60,5,70,5\n", "more values than the first line names"),
+        ("x,y\n20,20\n".encode("utf-16"), "save it as CSV in UTF-8"),
     ],
 )
 def test_a_table_that_was_edited_wrongly_is_refused_before_any_work(done, table, message):
@@ -439,6 +441,58 @@ def test_a_table_that_was_edited_wrongly_is_refused_before_any_work(done, table,
     assert "columns.csv" in caught.value.where
     assert done.events == []
     assert (done.output / "columns.csv").read_bytes() == table
+
+
+@pytest.mark.parametrize("table", ["link", "pipe", "folder"])
+def test_a_table_that_cannot_be_reached_is_not_taken_for_none(done, tmp_path, table):
+    csv = done.output / "columns.csv"
+    csv.rename(tmp_path / "mine.csv")
+    if table == "link":
+        csv.symlink_to(tmp_path / "unmounted" / "mine.csv")
+    elif table == "pipe":
+        os.mkfifo(csv)
+    else:
+        csv.mkdir()
+    with pytest.raises(DestinationError) as caught:
+        done()
+    assert "columns.csv" in caught.value.where
+    assert done.events == []
+    assert os.path.lexists(csv)
+
+
+@pytest.mark.parametrize("name", ["drift.zarr", "sum.zarr", "columns.zarr", "results.zarr"])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_what_has_the_place_of_a_store_is_not_deleted(done, name, kind):
+    shutil.rmtree(done.output / name)
+    mine = done.output / name / "notes.txt" if kind == "folder" else done.output / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    with pytest.raises(DestinationError, match="holds something else"):
+        done()
+    assert done.events == []
+    assert mine.read_text() == "mine"
+
+
+def test_a_link_to_a_folder_that_is_not_there_is_named(job, tmp_path):
+    job.output.symlink_to(tmp_path / "unmounted")
+    with pytest.raises(DestinationError, match=r"a link to .*unmounted, which is not there"):
+        job()
+
+
+def test_a_folder_that_is_moved_while_a_run_works_is_said_and_goes_on_in_its_new_place(base, job, tmp_path):
+    moved = tmp_path / "moved"
+
+    def move(event):
+        if isinstance(event, ShardDone) and event.stage == "drift" and job.output.exists():
+            job.output.rename(moved)
+
+    with pytest.raises(StoreError, match=r"not there any more|no movie store here"):
+        pipeline.run(job.source, job.output, SETTINGS, client=job.client, on_event=move, report=False)
+    assert not job.output.exists()
+    again = Job(job.source, moved, job.client)
+    assert again().reused == ("convert",)
+    fits = [open_results(place / "results.zarr")["fit"].load() for place in (moved, base.output)]
+    xr.testing.assert_identical(*fits)
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EMFILE])

@@ -25,6 +25,8 @@ from .small_files import read_small
 METADATA = "zarr.json"
 _METADATA_BYTES = 16 << 20
 
+_OTHER_CHECKSUM = "its checksum is that of other data"
+
 FRAME_AXES = ("t", "frame")
 """Names of the axis along which the frames lie."""
 
@@ -55,7 +57,8 @@ def reading(file: Path) -> Iterator[None]:
     except OSError as error:
         raise unreadable(file, error) from error
     except (ValueError, RuntimeError) as error:
-        raise damaged(file, str(error)) from error
+        words = str(error)
+        raise damaged(file, _OTHER_CHECKSUM if words.startswith("Stored and computed") else words) from error
 
 
 def read_json(file: Path) -> dict[str, Any]:

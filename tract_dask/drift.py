@@ -162,6 +162,9 @@ def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
                 raise SourceError(f"column {missing[0]!r} is missing", f"{path}, line 1", expected, got, remedy)
             for row in reader:
                 where = f"{path}, line {reader.line_num}"
+                if any(value.strip() for value in row.pop(None, ())):
+                    expected, got = f"{len(header)}: {', '.join(header)}", "more: numbers are written with a point"
+                    raise SourceError("there are more values than the first line names", where, expected, got, remedy)
                 frame, shift = _parse_row(row, where, n_frames, remedy)
                 if frame in line_of:
                     what = f"frame {frame} is there twice"

@@ -72,6 +72,17 @@ def left_over(place: Path, expected: str, got: str) -> StoreError:
     )
 
 
+def _gone(folder: Path) -> StoreError:
+    """Return the error for a run whose folder was moved or deleted while it worked."""
+    return StoreError(
+        "the folder of the run is not there any more",
+        str(folder),
+        "the folder that the run began in, until it ends",
+        "none",
+        "Put it back, or give the same command with its new place: what is done is kept",
+    )
+
+
 def own_file(run: Path, suffix: str) -> Path:
     """Return the file in the folder of a run that this thread alone writes."""
     return run / f"{os.getpid()}-{_PROCESS}-{threading.get_native_id()}{suffix}"
@@ -144,6 +155,8 @@ class Journal:
             Where another has taken its place, or it is over.
         """
         if self._run() != self.path.name:
+            if not self.folder.parent.is_dir():
+                raise _gone(self.folder.parent) from None
             now = _current(self.folder)[1]
             got = f"run {now}" if now else "none: the run is over"
             raise left_over(self.folder, f"run {self.path.name}", got) from None

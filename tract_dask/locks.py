@@ -116,6 +116,10 @@ def _unlock(file: FileIO, kernel: bool | None) -> None:
         fcntl.flock(file, fcntl.LOCK_UN)
 
 
+_held_here: set[str] = set()
+"""Tokens of the locks that this process holds, or tries to."""
+
+
 @dataclass(frozen=True)
 class _Record:
     """Who holds a lock.
@@ -141,6 +145,8 @@ class _Record:
         """Whether its process has ended; None where that cannot be seen."""
         if self.place != _place():
             return None
+        if self.pid == os.getpid() and self.started == _started(self.pid):
+            return self.token not in _held_here  # a folder that was moved meanwhile keeps its record
         return not _runs(self.pid) or _started(self.pid) not in ("", self.started)
 
 
@@ -169,10 +175,14 @@ _Watches: TypeAlias = defaultdict[Path, _Watch]
 def _take(beside: Path, kernel: bool, watches: _Watches) -> _Record | None:
     """Leave a record if there is none that holds; None where there is."""
     own = _Record(uuid.uuid4().hex, platform.node(), _place(), os.getpid(), _started(os.getpid()))
+    _held_here.add(own.token)
     try:
         if _write_new(beside, own):
             return own
-        return own if not _holds(beside, watches[beside]) and _take_over(beside, own, watches) else None
+        if not _holds(beside, watches[beside]) and _take_over(beside, own, watches):
+            return own
+        _held_here.discard(own.token)
+        return None
     except OSError as error:
         if kernel:  # a full disk, say; the kernel's lock is enough
             return own
@@ -263,6 +273,7 @@ class _Beat:
         self._ending.set()
         self._thread.join(_END_S)  # it may wait for a dead disk
         _remove(self._beside, self._record)
+        _held_here.discard(self._record.token)
 
 
 def lock_files(lock: Path) -> tuple[Path, ...]:

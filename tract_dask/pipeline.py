@@ -104,10 +104,13 @@ class Outputs:
         """What happened when."""
         return self.root / "events.jsonl"
 
+    def stages(self) -> tuple[Path, ...]:
+        """Return the stores, in the order of the stages."""
+        return (self.movie, self.drift, self.sum, self.columns.with_suffix(".zarr"), self.results)
+
     def written(self) -> tuple[Path, ...]:
         """Return everything that a run writes: its stores, beside which journals may lie, then its files."""
-        stages = (self.movie, self.drift, self.sum, self.columns.with_suffix(".zarr"), self.results)
-        return (*stages, self.columns, self.columns.with_suffix(".png"), self.report, self.settings, self.events)
+        return (*self.stages(), self.columns, self.columns.with_suffix(".png"), self.report, self.settings, self.events)
 
     def paths(self) -> dict[str, str]:
         """Return the paths by name."""
@@ -624,6 +627,8 @@ def check_output(
         )
     if not overwrite:
         _check_movie(outputs, source, settings)
+        for path in outputs.stages()[1:]:
+            stores.check_place(path)
     stores.check_destination(outputs.movie, overwrite=overwrite)
 
 

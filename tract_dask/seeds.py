@@ -342,7 +342,9 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
         As :func:`read_columns_csv`.
     """
     header, rows = _rows(text, where)
-    numbers = [_Row(where, line, dict(zip(header, row, strict=False))) for line, row in rows]
+    for line, values in rows:
+        _check_width(values, header, f"{where}, line {line}")
+    numbers = [_Row(where, line, dict(zip(header, values, strict=False))) for line, values in rows]
     places = [[row.number("x"), row.number("y")] for row in numbers]
     ids = [row.integer("column_id") for row in numbers] if "column_id" in header else None
     first: dict[int, int] = {}
@@ -358,17 +360,29 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
         first[column] = row.line
     fit = np.full((len(numbers), len(schema.PARAMETERS)), np.nan)
     if set(_FIT_COLUMNS) <= set(header):
-        for row, values, place in zip(numbers, fit, places, strict=True):
+        for row, estimates, place in zip(numbers, fit, places, strict=True):
             if row.values["amplitude"]:
                 found = {name: row.number(name) for name in _FIT_COLUMNS} | {"x": place[0], "y": place[1]}
-                values[:] = [found[name] for name in schema.PARAMETERS]
+                estimates[:] = [found[name] for name in schema.PARAMETERS]
     kinds = [row.values.get("kind", "") for row in numbers]
     return column_dataset(places, kinds, ids, fit, [row.flags() for row in numbers])
 
 
+def _check_width(row: list[str], header: list[str], where: str) -> None:
+    """Refuse a row with more values than there are columns, as numbers with commas for their points have."""
+    if any(row[len(header) :]):
+        raise SettingsError(
+            "there are more values than the first line names",
+            where,
+            f"{len(header)} values: {', '.join(header)}",
+            f"{len(row)}: {', '.join(row)}"[:200],
+            "Write numbers with a point, and text with commas in quotes",
+        )
+
+
 def _unreadable(where: str, error: Exception) -> SettingsError:
     what = "the columns file cannot be read"
-    return SettingsError(what, where, "a CSV file", str(error), "Check its path and format")
+    return SettingsError(what, where, "a CSV file", str(error), "Check its path, and save it as CSV in UTF-8")
 
 
 def _rows(text: str, where: str) -> tuple[list[str], list[tuple[int, list[str]]]]:

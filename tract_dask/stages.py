@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -180,7 +181,17 @@ def check_edited(csv: Path, settings: ColumnSettings, shape: tuple[int, ...]) ->
     ------
     SettingsError
         Where it cannot be read, or columns lie outside the image.
+    DestinationError
+        Where something else has its place: a link that leads nowhere may be one to columns that were edited.
     """
+    if os.path.lexists(csv) and not csv.is_file():
+        raise DestinationError(
+            "the table of columns cannot be reached",
+            str(csv),
+            "a file, or nothing",
+            f"a link to {csv.readlink()}, which is not there" if csv.is_symlink() else "no file",
+            "Bring it back, or move what is there away: then columns are found anew",
+        )
     if _Table.read(csv, settings).is_edited:
         check_inside(read_columns_csv(csv), shape, str(csv))
 

@@ -423,14 +423,8 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
             "letters in UTF-8",
             remedy="Choose another place, or rename the folder",
         )
-    if path.exists() and not overwrite and not attributes(path) and not (path.is_dir() and not any(path.iterdir())):
-        raise DestinationError(
-            "this place holds something else",
-            str(path),
-            "nothing, or a store of tract_dask",
-            "a folder" if path.is_dir() else "a file",
-            "Choose another place, or say --overwrite",
-        )
+    if not overwrite:
+        check_place(path)
     folder = path.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -442,9 +436,29 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
             "this folder cannot be written",
             str(folder),
             "a folder that you may write to",
-            error.strerror or str(error),
+            f"a link to {folder.readlink()}, which is not there"
+            if folder.is_symlink() and not folder.exists()
+            else error.strerror or str(error),
             "Choose another place, or mend its permissions",
         ) from error
+
+
+def check_place(path: Path) -> None:
+    """Check that nothing lies at ``path``, or a store of ours.
+
+    Raises
+    ------
+    DestinationError
+        Where it is something else.
+    """
+    if path.exists() and not attributes(path) and not (path.is_dir() and not any(path.iterdir())):
+        raise DestinationError(
+            "this place holds something else",
+            str(path),
+            "nothing, or a store of tract_dask",
+            "a folder" if path.is_dir() else "a file",
+            "Choose another place, or say --overwrite",
+        )
 
 
 def check_free_space(path: Path, needed: int) -> None:
