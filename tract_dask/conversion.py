@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -55,7 +55,7 @@ def convert(
     settings: ConvertSettings = _DEFAULT_LAYOUT,
     source_settings: SourceSettings = _DECLARED_NOTHING,
     metadata: MetadataSettings = _AS_THE_FILE_SAYS,
-    client: Client | None = None,
+    client: Client | Callable[[], Client] | None = None,
     on_event: Sink = silent,
     overwrite: bool = False,
 ) -> Path:
@@ -73,7 +73,7 @@ def convert(
     metadata
         What the user knows better than the file.
     client
-        The cluster to run on; None runs in this process.
+        The cluster to run on, or what gives it, called where there is work; None runs in this process.
     on_event
         Told how the work goes.
     overwrite
@@ -108,6 +108,7 @@ def convert(
     layout = plan_layout(movie.shape, movie.dtype, settings)
     shards = split(n_frames, layout.frames_per_shard)
     _check_destination(path, movie, settings, source_settings, overwrite=overwrite)
+    workers = client() if callable(client) else client
     journal = _begun(path, movie, known, layout, settings, source_settings, on_event)
     on_event(announce(done_frames=journal.frames_done(shards)))
     statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
@@ -125,7 +126,7 @@ def convert(
             keep,
             journal=journal,
             name=STAGE,
-            client=client,
+            client=workers,
             on_done=lambda shard, payload: on_event(ShardDone(STAGE, shard.index, shard.frames)),
             file=movie.path,
             on_event=on_event,

@@ -22,7 +22,7 @@ import xarray as xr
 from distributed import Client
 
 from . import fit, stores
-from .conversion import convert, is_converted
+from .conversion import convert
 from .drift import estimate_drift
 from .errors import DestinationError
 from .io import FrameSource
@@ -67,14 +67,13 @@ def convert_stage(
     overwrite: bool = False,
 ) -> Movie:
     """Return the movie at ``path``, converted if it is not there yet; its metadata are made those of ``source``."""
-    done = is_converted(path, source, settings.convert, settings.source)
     convert(
         source,
         path,
         settings=settings.convert,
         source_settings=settings.source,
         metadata=settings.metadata,
-        client=None if done else workers(),
+        client=workers,
         on_event=on_event,
         overwrite=overwrite,
     )

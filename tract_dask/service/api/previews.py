@@ -108,80 +108,47 @@ Raw = Annotated[SourceSettings, Depends(declared_raw)]
 Gain = Annotated[MetadataSettings, Depends(declared_gain)]
 
 
+async def file_frame(
+    request: Request, path: MoviePath, raw: Raw, gain: Gain, frame: FrameNumber = 0
+) -> pictures.MovieFrame:
+    """Return a frame of a file."""
+    place, version = await run_in_threadpool(_movie, request, path)
+    root = request.app.state.root
+    return pictures.MovieFrame(root.path / path, place, raw, gain, root.permit, frame, version)
+
+
+async def job_frame(job_id: JobId, request: Request, frame: FrameNumber = 0) -> pictures.MovieFrame:
+    """Return a frame of a job's movie."""
+    found, version = await run_in_threadpool(_job_movie, request, job_id)
+    return pictures.MovieFrame(str(found[0]), *found, request.app.state.root.permit, frame, version)
+
+
+FileFrame = Annotated[pictures.MovieFrame, Depends(file_frame)]
+JobFrame = Annotated[pictures.MovieFrame, Depends(job_frame)]
+
+
 @router.get("/files/frame.png", response_class=Response, responses=_PICTURE)
-async def frame_picture(
-    request: Request, path: MoviePath, seen: Seen, raw: Raw, gain: Gain, frame: FrameNumber = 0, said: Version = ""
-) -> Response:
+async def frame_picture(request: Request, frame: FileFrame, seen: Seen, said: Version = "") -> Response:
     """Show a part of a frame of a movie on disk, in any format, also of a converted one."""
-    place, version = await run_in_threadpool(_movie, request, path)
-    about = (place, raw, gain, request.app.state.root.permit)
-    return await kept_answer(
-        request,
-        "image/png",
-        version,
-        pictures.source_png,
-        *about,
-        frame,
-        seen,
-        version,
-        about=_file(request, path),
-        said=said,
-    )
+    return await _picture(request, frame, seen, said)
 
 
-@router.get(
-    "/files/histogram",
-    response_class=Response,
-    responses=_LEVELS,
-)
-async def frame_histogram(
-    request: Request, path: MoviePath, seen: Seen, raw: Raw, gain: Gain, frame: FrameNumber = 0
-) -> Response:
+@router.get("/files/histogram", response_class=Response, responses=_LEVELS)
+async def frame_histogram(request: Request, frame: FileFrame, seen: Seen) -> Response:
     """Tell what values a frame has, as frame.png shows it with the same parameters."""
-    place, version = await run_in_threadpool(_movie, request, path)
-    about = (place, raw, gain, request.app.state.root.permit)
-    return await kept_answer(
-        request,
-        "application/json",
-        version,
-        pictures.source_levels,
-        *about,
-        frame,
-        seen,
-        version,
-        about=_file(request, path),
-    )
+    return await _levels(request, frame, seen)
 
 
 @router.get("/jobs/{job_id}/frame.png", response_class=Response, responses=_PICTURE)
-async def job_frame_picture(
-    job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0, said: Version = ""
-) -> Response:
+async def job_frame_picture(request: Request, frame: JobFrame, seen: Seen, said: Version = "") -> Response:
     """Show a part of a frame of a job's movie."""
-    found, version = await run_in_threadpool(_job_movie, request, job_id)
-    opened = (*found, request.app.state.root.permit)
-    return await kept_answer(
-        request,
-        "image/png",
-        version,
-        pictures.source_png,
-        *opened,
-        frame,
-        seen,
-        version,
-        about=str(found[0]),
-        said=said,
-    )
+    return await _picture(request, frame, seen, said)
 
 
 @router.get("/jobs/{job_id}/histogram", response_class=Response, responses=_LEVELS)
-async def job_frame_histogram(job_id: JobId, request: Request, seen: Seen, frame: FrameNumber = 0) -> Response:
+async def job_frame_histogram(request: Request, frame: JobFrame, seen: Seen) -> Response:
     """Tell what values a frame of a job's movie has, as its frame.png shows it with the same parameters."""
-    found, version = await run_in_threadpool(_job_movie, request, job_id)
-    opened = (*found, request.app.state.root.permit)
-    return await kept_answer(
-        request, "application/json", version, pictures.source_levels, *opened, frame, seen, version, about=str(found[0])
-    )
+    return await _levels(request, frame, seen)
 
 
 @router.get("/jobs/{job_id}/sum.png", response_class=Response, responses=_PICTURE)
@@ -227,10 +194,14 @@ def folder_of(request: Request, job_id: str, *names: str) -> Path:
     return found
 
 
-def _file(request: Request, path: str) -> Path:
-    """Return the file that a path in a request names, to be named in errors."""
-    found: Path = request.app.state.root.path / path
-    return found
+async def _picture(request: Request, frame: pictures.MovieFrame, seen: View, said: str) -> Response:
+    make = pictures.source_png
+    return await kept_answer(request, "image/png", frame.stamp, make, frame, seen, about=frame.named, said=said)
+
+
+async def _levels(request: Request, frame: pictures.MovieFrame, seen: View) -> Response:
+    make = pictures.source_levels
+    return await kept_answer(request, "application/json", frame.stamp, make, frame, seen, about=frame.named)
 
 
 def _movie(request: Request, path: str) -> tuple[str | FileList, str]:

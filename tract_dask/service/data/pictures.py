@@ -109,36 +109,41 @@ class Plane:
     gain: float = 1.0
 
 
-def source_png(
-    path: str | FileList,
-    source: SourceSettings,
-    metadata: MetadataSettings,
-    permit: Permit | None,
-    frame: int,
-    view: View,
-    stamp: str,
-) -> bytes:
-    """Return a frame of a movie on disk, in any format, as PNG; ``stamp`` tells the file from what it was before."""
-    return _png(source_plane(path, source, metadata, permit, frame, stamp), view)
+@dataclass(frozen=True)
+class MovieFrame:
+    """A frame of a movie on disk, in any format, also of a converted one.
+
+    Attributes
+    ----------
+    named
+        The file as a request names it, for errors.
+    stamp
+        Tells the file from what it was before.
+    """
+
+    named: str | Path
+    path: str | FileList
+    source: SourceSettings
+    metadata: MetadataSettings
+    permit: Permit | None
+    number: int
+    stamp: str
 
 
-def source_levels(
-    path: str | FileList,
-    source: SourceSettings,
-    metadata: MetadataSettings,
-    permit: Permit | None,
-    frame: int,
-    view: View,
-    stamp: str,
-) -> bytes:
+def source_png(frame: MovieFrame, view: View) -> bytes:
+    """Return a frame of a movie as PNG."""
+    return _png(source_plane(frame), view)
+
+
+def source_levels(frame: MovieFrame, view: View) -> bytes:
     """Return what values a frame has, seen like that, and the size of its pixels; see :func:`levels`."""
-    found = levels(source_plane(path, source, metadata, permit, frame, stamp), view)
+    found = levels(source_plane(frame), view)
     opened: Movie | SourceMetadata
-    if _is_converted(path):
-        opened = _opened_movie(str(path), stamp)
+    if _is_converted(frame.path):
+        opened = _opened_movie(str(frame.path), frame.stamp)
     else:
-        opened = open_cached(path, source, metadata, permit=permit).metadata
-    return as_json(found | {"pixel_size_pm": opened.pixel_size_pm, "version": stamp})
+        opened = open_cached(frame.path, frame.source, frame.metadata, permit=frame.permit).metadata
+    return as_json(found | {"pixel_size_pm": opened.pixel_size_pm, "version": frame.stamp})
 
 
 def sum_png(folder: Path, view: View, stamp: str) -> bytes:
@@ -158,29 +163,23 @@ def _is_converted(path: str | FileList) -> bool:
     return isinstance(path, str) and path.endswith(".zarr")
 
 
-def source_plane(
-    path: str | FileList,
-    source: SourceSettings,
-    metadata: MetadataSettings,
-    permit: Permit | None,
-    frame: int,
-    stamp: str,
-) -> Plane:
-    """Return a frame of a movie on disk.
+def source_plane(frame: MovieFrame) -> Plane:
+    """Return the pixels of a frame.
 
     Raises
     ------
     InputError
         Where there is no such frame, or the movie cannot be opened.
     """
-    if _is_converted(path):
-        return movie_plane(_opened_movie(str(path), stamp), frame)
-    opened = open_cached(path, source, metadata, permit=permit)
-    _check_frame(frame, opened.shape[0])
-    _check_size(str(path), opened.shape[1:])
+    if _is_converted(frame.path):
+        return movie_plane(_opened_movie(str(frame.path), frame.stamp), frame.number)
+    opened = open_cached(frame.path, frame.source, frame.metadata, permit=frame.permit)
+    _check_frame(frame.number, opened.shape[0])
+    _check_size(str(frame.path), opened.shape[1:])
 
     def read(_: int, rows: slice, columns: slice) -> Pixels:
-        return _source_frame(path, source, permit, frame, stamp)[rows, columns]
+        pixels = _source_frame(frame.path, frame.source, frame.permit, frame.number, frame.stamp)
+        return pixels[rows, columns]
 
     return Plane(opened.shape[1:], (1,), read, opened.metadata.gain)
 
