@@ -220,3 +220,12 @@ def test_a_disk_error_says_so(lock, monkeypatch):
     without_locks(monkeypatch, errno.EIO)
     with pytest.raises(DestinationError, match=r"cannot be held against other processes.*error"):
         take(lock)
+
+
+def test_a_folder_that_was_moved_while_it_was_held_can_be_held_again_by_the_same_process(tmp_path):
+    lock, moved = tmp_path / "out" / ".lock", tmp_path / "moved"
+    lock.parent.mkdir()
+    with sole_use(lock, BUSY):
+        lock.parent.rename(moved)
+    with sole_use(moved / lock.name, BUSY), pytest.raises(DestinationError, match=BUSY):
+        sole_use(moved / lock.name, BUSY).__enter__()
