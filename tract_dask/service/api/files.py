@@ -120,4 +120,4 @@ async def about_file(
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
     place, file = await run_in_threadpool(state.root.source, path), state.root.path / path
     found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit, about=file)
-    return found | {"path": path}
+    return state.root.shown(found) | {"path": path}

@@ -8,10 +8,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
+from ..jobs.records import Deletion
 from ..jobs.states import State
 from ..jobs.store import Job, JobStore
 from ..planning import check_job
-from ..tidying import delete_folder
+from ..tidying import delete_files
 from .asking import OwnJob, Who
 from .models import After, Deleted, JobDetail, JobId, JobList, JobRecord, Label, Log, LogLine, NewJob, NewLabel, errors
 
@@ -108,8 +109,8 @@ def delete_job(
 ) -> Deleted:
     """Delete a job that has ended, or waits; its files stay where they are, unless they are to go with it."""
     state = request.app.state
-    state.store.delete(own.id)
-    kept = delete_folder(state.root, state.store, own) if files else ""
+    state.store.delete(own.id, files=files)
+    kept = delete_files(state.root, state.store, Deletion(own.id, own.owner, own.output)) if files else ""
     return Deleted(id=own.id, files=files and not kept, kept=kept)
 
 
