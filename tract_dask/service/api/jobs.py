@@ -7,6 +7,7 @@ from itertools import accumulate
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
+from starlette.concurrency import run_in_threadpool
 
 from ..jobs.records import Deletion
 from ..jobs.states import State
@@ -27,9 +28,8 @@ async def submit_job(new: NewJob, request: Request, response: Response, who: Who
     """Queue a job, after the checks that a run makes before it starts: the movie opens, and the settings fit it."""
     state = request.app.state
     settings, output, _ = await check_job(state, who.name, new.source, new.settings, new.output)
-    job: Job = state.store.submit(
-        source=new.source, settings=settings, owner=who.name, label=new.label, output=output, curate=new.curate
-    )
+    about = {"source": new.source, "owner": who.name, "label": new.label, "output": output, "curate": new.curate}
+    job: Job = await run_in_threadpool(state.store.submit, settings=settings, **about)
     state.runner.wake()
     response.headers["Location"] = str(request.url_for("read_job", job_id=job.id).path)
     return job
