@@ -13,6 +13,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 from serviced import make_app, make_root
+from starving import reserved
 
 from tract_dask.drift import read_drift_csv
 from tract_dask.errors import SettingsError, SourceError
@@ -252,6 +253,19 @@ def test_a_bad_body_of_columns_is_refused(api, name, end):
     assert answer.status_code == 422, answer.text
     assert answer.json()["error"]["what"]
     assert len(answer.content) < 20_000
+
+
+def test_libraries_reserve_little_of_the_memory_of_a_request():
+    """A pool of memory that Arrow reserves for itself, 1 GiB, left half of the limit to a table of columns."""
+
+    async def first() -> int:
+        workshop = Workshop(1, memory=2 << 30)
+        try:
+            return await workshop.run(reserved)
+        finally:
+            workshop.close()
+
+    assert asyncio.run(first()) < 256 << 20
 
 
 def test_too_many_values_are_counted_before_they_are_looked_at(monkeypatch):

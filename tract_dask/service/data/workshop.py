@@ -400,7 +400,9 @@ class _Worker:
 def _work(pipe: Connection, hiring: _Hiring) -> None:
     """Do what comes through the pipe until its other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to answer
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    os.environ.update(
+        dict.fromkeys(THREAD_VARIABLES, "1"), ARROW_DEFAULT_MEMORY_POOL="system"
+    )  # it reserves 1 GiB else
     with uncollected():
         for module in hiring.imported:
             import_module(module)
