@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from tract_dask.io import READERS
+from tract_dask.seeds import column_dataset
+from tract_dask.service.data.workshop import _private
 
 
 def crash(path: Path, *_: object):
@@ -21,6 +23,13 @@ def hang(path: Path, *_: object):
 
 def starve(path: Path, *_: object):
     return np.ones(8 << 30, np.uint8)
+
+
+def reserved() -> int:
+    """Return the bytes of private memory that a table of one column takes, with the libraries that it needs."""
+    before = _private()
+    column_dataset([[1.0, 2.0]])
+    return _private() - before
 
 
 if multiprocessing.parent_process() is not None:  # not where the tests are collected

@@ -115,6 +115,25 @@ def rows(columns: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
+def test_long_tables_stay_in_the_workshop(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To pack and unpack what is in them would hold other requests up."""
+    passed, run = [], service.app.state.workshop.run
+
+    async def noted(function: Any, *args: Any, **limits: Any) -> Any:
+        value = await run(function, *args, **limits)
+        passed.extend((*args, *(value if isinstance(value, tuple) else [value])))
+        return value
+
+    monkeypatch.setattr(service.app.state.workshop, "run", noted)
+    table = {"columns": rows(service.found), "note": "one", "base": 0}
+    assert service.post("/columns", table, 201) == {"version": 1, "count": len(TRUTH), "newer": []}
+    assert len(service.post("/columns/refine", {"columns": rows(service.found)})["columns"]) == len(TRUTH)
+    assert len(passed) == 9
+    assert all(
+        isinstance(part, curation.Scene | int | str | bytes) or part == {"note": "one", "base": 0} for part in passed
+    )
+
+
 def test_version_0_is_what_the_settings_find(service: Service) -> None:
     listed = service.get("/columns")
     assert [(one["version"], one["count"]) for one in listed["versions"]] == [(0, len(TRUTH))]

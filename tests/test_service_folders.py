@@ -6,6 +6,7 @@ import os
 import socket
 from functools import partial
 from itertools import product
+from pathlib import Path
 
 import httpx
 import pytest
@@ -323,3 +324,21 @@ def test_names_that_are_not_utf8_are_shown_and_pipes_left_out(tmp_path):
     for name in ("pipe.tif", "s.tif"):
         with pytest.raises(OutsideError, match="neither a file nor a folder"):
             DataRoot(tmp_path).source(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("{root}/a b/c.tif: gone", "a b/c.tif: gone"),
+        ("'{root}/x' and ({root}/y), at {root}/", "'x' and (y), at the data root"),
+        ("in {root}. Or {root}: or {root}", "in the data root. Or the data root: or the data root"),
+        ("{root}2/x, {root}-old, {root}.old, /mnt{root}/x", "{root}2/x, {root}-old, {root}.old, /mnt{root}/x"),
+        ("file://{root}/x, PosixPath('{root}/y')", "file://x, PosixPath('y')"),
+    ],
+)
+def test_paths_are_shown_relative_to_the_root(tmp_path, text, shown):
+    root = DataRoot(tmp_path)
+    text, shown = (part.replace("{root}", str(tmp_path)) for part in (text, shown))
+    assert root.shown(text) == shown
+    assert root.shown({"a": [text, 1.5, None], "b": {"c": text}}) == {"a": [shown, 1.5, None], "b": {"c": shown}}
+    assert DataRoot(Path("/")).shown("/tmp/x") == "/tmp/x"

@@ -1,6 +1,7 @@
 """What one request may cost: files, tables, bodies and lists that are too large or deadly are refused by name."""
 
 import asyncio
+import gc
 import json
 import os
 import sys
@@ -12,6 +13,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 from serviced import make_app, make_root
+from starving import reserved
 
 from tract_dask.drift import read_drift_csv
 from tract_dask.errors import SettingsError, SourceError
@@ -23,7 +25,11 @@ from tract_dask.seeds import (
     read_columns_csv,
     settings_lattices,
 )
+from tract_dask.service.api import models
+from tract_dask.service.api.answers import whole
+from tract_dask.service.config import ServiceConfig
 from tract_dask.service.data.workshop import Workshop
+from tract_dask.service.serving import make_application
 from tract_dask.settings import ColumnSettings, FitSettings, SourceSettings, from_dict
 from tract_dask.small_files import read_small
 
@@ -247,6 +253,71 @@ def test_a_bad_body_of_columns_is_refused(api, name, end):
     assert answer.status_code == 422, answer.text
     assert answer.json()["error"]["what"]
     assert len(answer.content) < 20_000
+
+
+def test_libraries_reserve_little_of_the_memory_of_a_request():
+    """A pool of memory that Arrow reserves for itself, 1 GiB, left half of the limit to a table of columns."""
+
+    async def first() -> int:
+        workshop = Workshop(1, memory=2 << 30)
+        try:
+            return await workshop.run(reserved)
+        finally:
+            workshop.close()
+
+    assert asyncio.run(first()) < 256 << 20
+
+
+def test_too_many_values_are_counted_before_they_are_looked_at(monkeypatch):
+    seen, parts = [], models._parts
+    monkeypatch.setattr(models, "_parts", lambda name, value: seen.append(value) or parts(name, value))
+    many = [1.5] * (models.MAX_ITEMS + 1)
+    with pytest.raises(ValueError, match="more than 20000 values"):
+        models.plain_values({"columns": {"lattices": [many]}})
+    assert many not in seen
+    models.plain_values({"columns": {"lattices": [[1.5] * (models.MAX_ITEMS - 6)]}})
+    with pytest.raises(ValueError, match="more than 20000 values"):
+        models.plain_values({"columns": {"lattices": [[1.5] * (models.MAX_ITEMS - 5)]}})
+
+
+@pytest.mark.parametrize("text", ["a\x00", "\x1f", "\x7f", "\x9fb", "\ud800", "x\udfff"])
+def test_texts_are_plain(text):
+    with pytest.raises(ValueError, match="control characters"):
+        models.plain_text(text)
+    assert models.plain_text("Å ü 漢 \xa0\ue000\ud7ff~") == "Å ü 漢 \xa0\ue000\ud7ff~"
+
+
+def test_a_large_answer_goes_out_in_parts():
+    async def sent(response) -> list[bytes]:
+        return [part async for part in response.body_iterator]
+
+    content = bytes(range(256)) * 3000
+    response = whole(content, "application/json", {"ETag": "x"})
+    found = asyncio.run(sent(response))
+    assert b"".join(found) == content
+    assert max(map(len, found)) == 1 << 18
+    assert (response.headers["content-length"], response.headers["etag"]) == (str(len(content)), "x")
+    assert whole(b"{}", "application/json").body == b"{}"
+
+
+def test_a_job_is_kept_by_another_thread_than_that_of_the_requests(api, monkeypatch):
+    """The job store waits for the disk."""
+    submit = api.app.state.store.submit
+
+    def kept(**about):
+        with pytest.raises(RuntimeError, match="no running event loop"):
+            asyncio.get_running_loop()
+        return submit(**about)
+
+    monkeypatch.setattr(api.app.state.store, "submit", kept)
+    assert api.post("jobs", json={"source": "movie.npy"}).status_code == 201
+
+
+def test_the_first_requests_wait_for_nothing(tmp_path):
+    before = gc.get_freeze_count()
+    app = make_application(ServiceConfig(tmp_path, state_dir=tmp_path / "state"))
+    assert app.openapi_schema["paths"]
+    assert gc.get_freeze_count() > before + 10_000
 
 
 def test_only_tables_of_columns_may_be_long(api):

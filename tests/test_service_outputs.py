@@ -1,10 +1,14 @@
 """A folder of results is the job's that made it: nobody else writes there, and nothing is deleted but what it wrote."""
 
 import json
+import os
 import shutil
 import threading
+from contextlib import suppress
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
+from time import monotonic, sleep
 
 import pytest
 from fastapi.testclient import TestClient
@@ -18,6 +22,8 @@ from tract_dask.service.folders import DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.outputs import MARK, Mark, check_owner, claim, read_mark, seal
 from tract_dask.service.refusals import ForbiddenError
+from tract_dask.service.running.keeper import Keeper
+from tract_dask.service.tidying import delete_files, finish_deletions
 
 URL = "http://127.0.0.1:8000/api/v1"
 OWNERS = {"ana": "user", "ben": "user", "root": "admin"}
@@ -206,6 +212,88 @@ def test_what_a_job_wrote_goes_with_it(app, root, clients):
     job = submit(clients["ana"])
     clients["ana"].post(f"jobs/{job['id']}/cancel")
     assert delete(clients["ana"], job)["files"]
+
+
+class KilledError(BaseException):
+    """The process ended here."""
+
+
+@pytest.mark.parametrize("more", [{}, {"output": "named/run"}])
+def test_a_deletion_that_is_cut_off_anywhere_is_gone_on_with_at_the_next_start(app, root, clients, more, monkeypatch):
+    store = app.state.store
+    for steps in count():
+        job, folder = done(app, root, clients["ana"], **more)
+        (folder / ".movie.zarr.x.partial").mkdir()
+        store.delete(job["id"], files=True)
+        (left,) = store.deletions()
+        with monkeypatch.context() as patch:
+            _kill_after(steps, patch)
+            with suppress(KilledError):
+                assert delete_files(DataRoot(root), store, left) == ""
+        was_cut_off = store.deletions() == [left]
+        finish_deletions(DataRoot(root), store)
+        assert not folder.exists(), steps
+        assert store.deletions() == []
+        assert folder.parent.exists()
+        if not was_cut_off:
+            break
+    assert steps > 20
+
+
+def _kill_after(steps: int, patch: pytest.MonkeyPatch) -> None:
+    """Let the process end before the file that would be deleted or replaced next, after ``steps`` of them.
+
+    Not at the files of the lock, which end with their process: this one goes on.
+    """
+    left = iter(range(steps))
+
+    def cut(function):
+        def wrapped(path, *args, **options):
+            if not Path(path).name.startswith(".lock") and next(left, None) is None:
+                raise KilledError
+            return function(path, *args, **options)
+
+        return wrapped
+
+    for name in ("unlink", "rmdir", "replace", "rename"):
+        patch.setattr(os, name, cut(getattr(os, name)))
+
+
+def test_what_was_changed_stays_also_where_its_deletion_was_cut_off(app, root, clients, monkeypatch):
+    job, folder = done(app, root, clients["ana"], output="run")
+    (folder / "run.toml").write_text("made by hand")
+    app.state.store.delete(job["id"], files=True)
+    with monkeypatch.context() as patch:
+        _kill_after(6, patch)
+        with pytest.raises(KilledError):
+            finish_deletions(DataRoot(root), app.state.store)
+    finish_deletions(DataRoot(root), app.state.store)
+    assert set(files(folder)) == {"run.toml", ".lock", MARK}
+    assert app.state.store.deletions() == []
+
+
+def test_a_new_job_may_take_a_folder_whose_deletion_was_cut_off(app, root, clients):
+    job, folder = done(app, root, clients["ana"], output="run")
+    app.state.store.delete(job["id"], files=True)
+    following = submit(clients["ana"], output="run")
+    work(app, root, following)
+    before = files(folder)
+    finish_deletions(DataRoot(root), app.state.store)
+    assert files(folder) == before
+    assert app.state.store.deletions() == []
+
+
+def test_the_runner_goes_on_with_deletions_when_it_starts(app, root, clients, monkeypatch):
+    job, folder = done(app, root, clients["ana"])
+    app.state.store.delete(job["id"], files=True)
+    for name in ("start", "stop"):
+        monkeypatch.setattr(Keeper, name, lambda keeper: None)
+    app.state.runner.start()
+    deadline = monotonic() + 20
+    while app.state.store.deletions() and monotonic() < deadline:
+        sleep(0.01)
+    app.state.runner.stop()
+    assert not folder.exists()
 
 
 def test_what_others_put_there_stays(app, root, clients):

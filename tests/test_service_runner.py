@@ -14,7 +14,7 @@ from conftest import Scene
 from distributed import Client, LocalCluster
 
 from tract_dask import meter, pipeline
-from tract_dask.errors import ClusterError, DestinationError, InputError
+from tract_dask.errors import ClusterError, DestinationError, InputError, TractError
 from tract_dask.progress import REPORT, STAGES, ShardDone, StageDone, StageStarted
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.jobs.clock import utc_now
@@ -235,6 +235,36 @@ def test_an_error_in_data_fails_at_once_with_its_text_and_what_the_process_said_
     ended = wait_for(store, job, *ENDED)
     assert (ended.state, ended.reason, ended.attempts) == (State.FAILED, "no columns", 1)
     assert {"last words", "no columns"} <= {event.data["message"] for event in store.log_of(job.id)}
+
+
+def test_paths_are_shown_relative_to_the_data_root(store, started, tmp_path):
+    job = queue(store)
+    started(
+        "root = order['root']\n"
+        "print(f'File \"{root}/one.py\", line 3', file=sys.stderr)\n"
+        "say(kind='stage', stage='fit')\n"
+        "say(kind='log', level='warning', message=f'{root}/movie.npy: frame 3, {root}2/movie.npy: frame 4')\n"
+        "say(kind='progress', shards=1, data={'stages': {'fit': {'summary': f'see {root}/jobs/x/columns.csv'}}})\n"
+        "say(kind='error', lost=False, text=f'{root}/jobs/x/movie.zarr: cannot be read. Free room in {root}.')\n"
+        "sys.exit(1)"
+    )
+    ended = wait_for(store, job, *ENDED)
+    assert ended.reason == "jobs/x/movie.zarr: cannot be read. Free room in the data root."
+    lines = [event.data["message"] for event in store.log_of(job.id)]
+    assert lines == [f"movie.npy: frame 3, {tmp_path}2/movie.npy: frame 4", 'File "one.py", line 3', ended.reason]
+    seen = json.dumps([event.data for event in store.events()] + store.transitions(job.id) + [ended.progress])
+    assert "see jobs/x/columns.csv" in seen
+    assert f"{tmp_path}/" not in seen
+
+
+def test_paths_in_what_the_service_finds_itself_are_shown_relative_to_the_data_root(store, started, tmp_path):
+    class Broken(NoCluster):
+        def ready(self, timeout_s: float) -> ClusterSettings:
+            raise TractError("no", f"{tmp_path}/jobs")
+
+    job = queue(store)
+    started("", Broken())
+    assert wait_for(store, job, *ENDED).reason == "jobs: no."
 
 
 def test_a_process_that_dies_before_it_has_its_order_is_tried_again(store, started, monkeypatch):

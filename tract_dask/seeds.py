@@ -272,6 +272,7 @@ def columns_csv(columns: xr.Dataset) -> str:
 
     Numbers keep their full precision; :func:`parse_columns_csv` gives back what was written.
     """
+    flags = {status: " ".join(flag_names(status)) for status in np.unique(columns["status_ref"].to_numpy()).tolist()}
     fits = columns["fit_ref"].sel(parameter=list(_FIT_COLUMNS)).to_numpy()
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -285,7 +286,7 @@ def columns_csv(columns: xr.Dataset) -> str:
         strict=True,
     ):
         numbers = [repr(value) if math.isfinite(value) else "" for value in fit]
-        writer.writerow([column, repr(x), repr(y), str(kind), *numbers, " ".join(flag_names(status))])
+        writer.writerow([column, repr(x), repr(y), str(kind), *numbers, flags[status]])
     return text.getvalue()
 
 

@@ -8,6 +8,7 @@ link between check and use; the service itself makes no links.
 from __future__ import annotations
 
 import os
+import re
 import stat
 import unicodedata
 from bisect import bisect_right
@@ -15,12 +16,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar, cast
 
 from .. import stores
 from ..errors import DestinationError, InputError, MissingStoreError, StoreError
 from ..io import READERS, FileList, list_files, unknown_format
 from ..io.listing import WILD
+
+T = TypeVar("T")
 
 STATE_FOLDER = ".tract_dask"
 """Where earlier versions kept the service's own store, under the data root; no request reaches it."""
@@ -140,6 +143,8 @@ class DataRoot:
 
     def __init__(self, root: Path, closed: tuple[Path, ...] = ()) -> None:
         self.path = Path(os.path.realpath(root))
+        own = "(?!)" if self.path == Path("/") else re.escape(str(self.path))
+        self._own_path = re.compile(rf"(?<![\w.-]){own}(?:(/(?=[^\s/'\"):;,]))|/?(?![\w-]|\.\w))")
         self.permit = Bounds(self.path, tuple(Path(os.path.realpath(folder)) for folder in closed))
         if not self.path.is_dir():
             raise DestinationError(
@@ -268,6 +273,18 @@ class DataRoot:
                 if item.is_dir() and place not in seen:
                     seen.add(place)
                     waiting.append(place)
+
+    def shown(self, value: T) -> T:
+        """Return a text, or a JSON value with texts in it, as users are to see it: paths relative to the root."""
+        found: Any = value
+        match value:
+            case str():
+                found = self._own_path.sub(lambda match: "" if match[1] else "the data root", value)
+            case list():
+                found = [self.shown(part) for part in value]
+            case dict():
+                found = {name: self.shown(part) for name, part in value.items()}
+        return cast("T", found)
 
     def relative(self, path: Path) -> str:
         """Return the name, relative to the root, of a path under it.

@@ -33,6 +33,9 @@ LOCK = ".lock"
 JOBS = "jobs"
 """The folder of the outputs that jobs do not name themselves."""
 
+GOING = [-1]
+"""Instead of a signature, of what is being deleted."""
+
 _TRIES = 5
 _MARK_BYTES = 1 << 16
 
@@ -48,7 +51,7 @@ class Mark:
     output
         The folder, relative to the data root.
     made
-        What the job has left, by name, as :func:`signature` tells it; empty while it works.
+        What the job has left, by name, as :func:`signature` tells it, or :data:`GOING`; empty while it works.
     """
 
     owner: str
@@ -156,7 +159,7 @@ def claim(root: DataRoot, mark: Mark, patience_s: float = 0.0) -> None:
         with suppress(FileNotFoundError), sole_use(place / LOCK, "another run works in this folder", patience_s):
             check_owner(root, mark)
             if place.is_dir() and (mark.named_by_id or read_mark(place) is not None):
-                _write(place, mark)
+                write_mark(place, mark)
                 return
     raise _refused("this folder comes and goes", mark.output, "a folder that nobody else uses")
 
@@ -168,7 +171,7 @@ def seal(root: DataRoot, mark: Mark) -> None:
     if found is not None and found.job == mark.job:
         made = {path.name: signature(path) for path in Outputs(place).written() if path.exists()}
         with suppress(OSError):  # on a full disk nothing is noted, and what has a run's name counts as the job's
-            _write(place, replace(found, made=made))
+            write_mark(place, replace(found, made=made))
 
 
 def signature(path: Path) -> list[int]:
@@ -186,7 +189,7 @@ def _make(place: Path, mark: Mark) -> None:
     aside = place.with_name(f".{mark.job}.{secrets.token_hex(4)}.new")
     try:
         aside.mkdir()
-        _write(aside, mark)
+        write_mark(aside, mark)
         aside.rename(place)
     except OSError:  # somebody else made it meanwhile: looked at again
         shutil.rmtree(aside, ignore_errors=True)
@@ -194,7 +197,8 @@ def _make(place: Path, mark: Mark) -> None:
             raise
 
 
-def _write(folder: Path, mark: Mark) -> None:
+def write_mark(folder: Path, mark: Mark) -> None:
+    """Write the mark of a folder, whole or not at all."""
     stores.write_aside(folder / MARK, json.dumps(asdict(mark)).encode())
 
 

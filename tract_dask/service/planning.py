@@ -115,21 +115,21 @@ async def check_job(
         Where it cannot be done: the movie, the settings or the folder cannot be used.
     """
     root: DataRoot = state.root
-    settings = job_settings(values)
-    place, whole = await to_thread.run_sync(_checked_paths, root, owner, source, settings, output)
+    stored, place, whole = await to_thread.run_sync(_checked_parts, root, owner, source, values, output)
     folder = root.path / output if output else None
     file = root.path / source
     checked = await state.workshop.run(check_source, place, whole, folder, root.permit, about=file)
-    return stored_settings(settings), output, checked
+    return stored, output, checked
 
 
-def _checked_paths(
-    root: DataRoot, owner: str, source: str, settings: RunSettings, output: str
-) -> tuple[str | FileList, RunSettings]:
-    """Return the movie and the settings with whole paths; all that a job names may be used."""
+def _checked_parts(
+    root: DataRoot, owner: str, source: str, values: dict[str, Any], output: str
+) -> tuple[dict[str, Any], str | FileList, RunSettings]:
+    """Return the settings to be stored, the movie, and the settings with whole paths; all that is named may be used."""
+    settings = job_settings(values)
     if output:
         check_owner(root, Mark(owner, "", output))
-    return root.source(source), inside(root, settings)
+    return stored_settings(settings), root.source(source), inside(root, settings)
 
 
 async def plan_job(

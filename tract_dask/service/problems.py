@@ -18,7 +18,7 @@ from starlette.routing import Match
 
 from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
 from .data.crashes import CrashError, ExhaustedError
-from .folders import OutsideError
+from .folders import DataRoot, OutsideError
 from .jobs.store import ConflictError, JobStoreError, UnknownJobError, UnknownVersionError
 from .jobs.tables import store_error
 from .pages import error_page
@@ -84,19 +84,18 @@ ERRORS: dict[int | str, dict[str, Any]] = {
 """What every route of the API may answer with, for its OpenAPI document."""
 
 
-def answer(error: TractError, root: str = "", headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """Return the response for an error; paths in it are shown relative to the folder ``root``."""
+def answer(error: TractError, root: DataRoot | None = None, headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """Return the response for an error; paths in it are shown relative to the data root."""
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
     return JSONResponse(body(error, root), status, headers)
 
 
-def body(error: TractError, root: str = "") -> dict[str, dict[str, str]]:
+def body(error: TractError, root: DataRoot | None = None) -> dict[str, dict[str, str]]:
     """Return the body of the response for an error."""
     parts = {name: str(getattr(error, name)) for name in ("what", "where", "expected", "got", "remedy")}
     parts["text"] = str(error)
-    if root:
-        parts = {name: text.replace(f"{root}/", "").replace(root, "the data root") for name, text in parts.items()}
-    return {"error": parts | {"kind": type(error).__name__}}
+    shown = parts if root is None else root.shown(parts)
+    return {"error": shown | {"kind": type(error).__name__}}
 
 
 def install(app: FastAPI) -> None:
@@ -109,7 +108,7 @@ def install(app: FastAPI) -> None:
 
 def _tract_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, TractError)
-    found = answer(error, str(request.app.state.root.path))
+    found = answer(error, request.app.state.root)
     if found.status_code >= HTTPStatus.INTERNAL_SERVER_ERROR:
         log.warning("%s %s: %s", request.method, request.url.path, error)
     return _as_asked(request, found)

@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import socket
+import sys
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -13,9 +14,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import uvicorn
+from fastapi import FastAPI
 
 from ..certificates import EXPIRES_SOON_DAYS, SERVICE, SERVICE_KEY, check_certificates
 from ..errors import DestinationError, InputError
+from ..lazy import uncollected
 from ..locks import sole_use
 from .config import DATABASE, LOCK, LOOPBACK, ServiceConfig, state_folder
 from .entrance.access import Access, Role, Token
@@ -26,6 +29,9 @@ from .jobs.store import JobStore
 
 SHUTDOWN_S = 3
 """How long requests may take to end."""
+
+SWITCH_S = 1e-3
+"""For so long a thread may hold Python's lock while the requests' thread waits; several times in each request."""
 
 _BACKLOG = 512
 _TAKEN = "another service works on this data root"
@@ -56,17 +62,30 @@ def serve(config: ServiceConfig, say: Callable[[str], None]) -> None:
     ):
         config = replace(config, port=listener.getsockname()[1])
         notes = check_access(config) + check_traffic(config) + check_state(config)
-        from .app import create_app
-
+        app = make_application(config)
+        sys.setswitchinterval(SWITCH_S)
         logging.basicConfig(format="%(asctime)s %(levelname)-7s %(message)s", level=logging.WARNING)
         logging.getLogger(__package__).setLevel(logging.INFO)
-        app = create_app(config)
         for line in banner(config, notes):
             say(line)
         server = _Server(_settings(config, app), app.state.feed)
         with suppress(KeyboardInterrupt):  # uvicorn repeats the signal that it stopped for
             server.run(sockets=[listener])
         say("Stopped. Jobs that were running go on when the service starts again.")
+
+
+def make_application(config: ServiceConfig) -> FastAPI:
+    """Return the application with all that its first requests would have to wait for.
+
+    The framework makes the checks of a route, and the document of the API, when they are first asked for. That takes
+    most of a second, in which nothing else is answered; to look for garbage in the whole application, a tenth.
+    """
+    with uncollected():
+        from .app import create_app
+
+        app = create_app(config)
+        app.openapi()
+    return app
 
 
 class _Server(uvicorn.Server):

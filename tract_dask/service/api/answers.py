@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Query, Request, Response
+from fastapi.responses import StreamingResponse
 
 from ...io import FileList
 from ...journal import logs
@@ -24,6 +25,7 @@ Version = Annotated[
 
 NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "As the client has it (If-None-Match)."}}
 
+_PART_BYTES = 256 << 10
 _FOREVER = "private, max-age=31536000, immutable"
 _ASK = "private, no-cache"
 
@@ -40,6 +42,19 @@ def stamp(*paths: Path) -> str:
             except OSError:
                 digest.update(f"{file}\0-\0".encode())
     return digest.hexdigest()[:16]
+
+
+def whole(content: bytes, media_type: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Return a response; a large one goes out in parts, so that other requests are answered between them."""
+    if len(content) <= _PART_BYTES:
+        return Response(content, media_type=media_type, headers=headers)
+    size = {"Content-Length": str(len(content))}
+    return StreamingResponse(_parts(content), media_type=media_type, headers={**(headers or {}), **size})
+
+
+async def _parts(content: bytes) -> AsyncIterator[bytes]:
+    for begin in range(0, len(content), _PART_BYTES):
+        yield content[begin : begin + _PART_BYTES]
 
 
 async def kept_answer(
@@ -67,4 +82,4 @@ async def kept_answer(
     if key in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
     content = await request.app.state.workshop.run_kept(key, function, *args, about=about)
-    return Response(content, media_type=media_type, headers=headers)
+    return whole(content, media_type, headers)

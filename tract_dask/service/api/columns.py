@@ -20,11 +20,13 @@ from ...seeds import MOST_SITES
 from ...settings import RunSettings, from_dict
 from ..data import curation
 from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, Scene
+from ..data.workshop import Workshop
 from ..entrance.access import Identity, Role
 from ..jobs.states import CURATABLE, State
 from ..jobs.store import Job, JobStore
 from ..planning import inside
 from ..refusals import invalid
+from .answers import whole
 from .asking import OwnJob, Who
 from .models import JobId, JobRecord, Plain, Text, errors
 from .previews import folder_of
@@ -238,7 +240,10 @@ class Choice(BaseModel):
 
 @dataclass(frozen=True)
 class Given:
-    """The columns of a request: places (columns, 2), kinds and numbers, and what was said beside them."""
+    """The columns of a request: places (columns, 2), kinds and numbers, and what was said beside them.
+
+    It never leaves the process of the workshop that reads it: to pack so many values holds other requests up.
+    """
 
     places: NDArray[np.float64]
     kinds: list[str]
@@ -247,7 +252,7 @@ class Given:
 
     @property
     def parts(self) -> tuple[NDArray[np.float64], list[str], list[int | None]]:
-        """What is sent to the workshop."""
+        """What :mod:`tract_dask.service.data.curation` takes."""
         return self.places, self.kinds, self.column_ids
 
 
@@ -263,7 +268,7 @@ def _read(model: type[M], data: bytes) -> M:
 
 
 def read_columns(model: type[NewVersion] | type[ToRefine], data: bytes) -> Given:
-    """Return what the body of a request says; for a process of the workshop, since it may be long.
+    """Return what the body of a request says.
 
     Raises
     ------
@@ -280,6 +285,27 @@ def read_lattice(data: bytes) -> tuple[dict[str, Any], NDArray[np.float64]]:
     """Return a lattice and the columns beside it, (columns, 2); otherwise as :func:`read_columns`."""
     found = _read(Lattice, data)
     return found.model_dump(exclude={"beside"}), np.array(found.beside)
+
+
+def saved_table(scene: Scene, highest_id: int, data: bytes) -> tuple[str, int, dict[str, Any]]:
+    """Return the table that is to be kept, its number of columns, and what was said beside it; for the workshop.
+
+    New columns get numbers above ``highest_id``, of the versions that are kept, and those found automatically.
+    """
+    given = read_columns(NewVersion, data)
+    next_id = max(highest_id, curation.summary(scene)["highest_id"]) + 1
+    return curation.checked_csv(scene, *given.parts, next_id), len(given.places), given.said
+
+
+def refined_table(scene: Scene, data: bytes) -> bytes:
+    """Return the columns of a request refined, as JSON; for the workshop."""
+    given = read_columns(ToRefine, data)
+    return curation.refined_json(scene, *given.parts, given.said["spacing_px"])
+
+
+def sites_of_lattice(scene: Scene, data: bytes) -> bytes:
+    """Return the sites of the lattice of a request, as JSON; for the workshop."""
+    return curation.lattice_json(scene, *read_lattice(data))
 
 
 def _sent(model: type[BaseModel]) -> dict[str, Any]:
@@ -342,34 +368,30 @@ async def read_version(job_id: JobId, version: VersionNumber, request: Request, 
 async def save_version(own: OwnJob, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
     """Keep columns as a new version of a job's."""
     store, workshop, job_id = request.app.state.store, request.app.state.workshop, own.id
-    new = await workshop.run(read_columns, NewVersion, await request.body())
-    first = await workshop.run(curation.summary, scene, about=scene.sum)
-    known = await run_in_threadpool(_versions, store, job_id, first, who)
-    table = await workshop.run(curation.checked_csv, scene, *new.parts, known["next_column_id"])
-    note, given_base = new.said["note"].strip(), new.said["base"]
+    saved = await run_in_threadpool(store.columns_versions, job_id)
+    highest = await run_in_threadpool(_highest_of, store, job_id, saved)
+    table, count, said = await workshop.run(saved_table, scene, highest, await request.body(), about=scene.sum)
+    note, given_base = said["note"].strip(), said["base"]
     if given_base is not None:
         note = f"from version {given_base}: {note}" if note else f"from version {given_base}"
     version = await run_in_threadpool(store.add_columns, job_id, table, who.name, note)
     base = version if given_base is None else given_base
-    newer = [one["version"] for one in known["versions"] if one["version"] > base]
-    return {"version": version, "count": len(new.places), "newer": newer}
+    newer = [one["version"] for one in saved if one["version"] > base]
+    return {"version": version, "count": count, "newer": newer}
 
 
 @router.post("/jobs/{job_id}/columns/refine", responses=_answers(Refined), openapi_extra=_sent(ToRefine))
 async def refine_columns(job_id: JobId, request: Request, scene: OfJob) -> Response:
     """Fit columns in the summed image, as a run that is given them does; nothing is kept."""
-    workshop = request.app.state.workshop
-    given = await workshop.run(read_columns, ToRefine, await request.body())
-    spacing_px = given.said["spacing_px"]
-    return _json(await workshop.run(curation.refined_json, scene, *given.parts, spacing_px, about=scene.sum))
+    workshop: Workshop = request.app.state.workshop
+    return _json(await workshop.run(refined_table, scene, await request.body(), about=scene.sum))
 
 
 @router.post("/jobs/{job_id}/columns/lattice", responses=_answers(Sites), openapi_extra=_sent(Lattice))
 async def lattice_columns(job_id: JobId, request: Request, scene: OfJob) -> Response:
     """Make the sites of a lattice inside the summed image; nothing is kept."""
-    workshop = request.app.state.workshop
-    how, beside = await workshop.run(read_lattice, await request.body())
-    return _json(await workshop.run(curation.lattice_json, scene, how, beside, about=scene.sum))
+    workshop: Workshop = request.app.state.workshop
+    return _json(await workshop.run(sites_of_lattice, scene, await request.body(), about=scene.sum))
 
 
 @router.post("/jobs/{job_id}/continue", response_model=JobRecord, responses=errors(400, 404, 409))
@@ -394,16 +416,19 @@ def _versions(store: JobStore, job_id: str, first: dict[str, Any], who: Identity
         "note": "as the settings find them",
         "count": first["count"],
     }
-    highest = [first["highest_id"], *(_highest_id(store, job_id, one["version"]) for one in saved)]
     own = who.role == Role.ADMIN or who.name == job.owner
     return {
         "versions": [found, *saved],
-        "next_column_id": max(highest) + 1,
+        "next_column_id": max(first["highest_id"], _highest_of(store, job_id, saved)) + 1,
         "chosen": job.columns_version,
         "state": job.state,
         "may_save": own,
         "may_continue": own and job.state in CURATABLE,
     }
+
+
+def _highest_of(store: JobStore, job_id: str, saved: list[dict[str, Any]]) -> int:
+    return max((_highest_id(store, job_id, one["version"]) for one in saved), default=0)
 
 
 @lru_cache(maxsize=4096)
@@ -414,4 +439,4 @@ def _highest_id(store: JobStore, job_id: str, version: int) -> int:
 
 
 def _json(content: bytes) -> Response:
-    return Response(content, media_type="application/json")
+    return whole(content, "application/json")

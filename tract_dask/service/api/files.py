@@ -120,4 +120,5 @@ async def about_file(
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
     place, file = await run_in_threadpool(state.root.source, path), state.root.path / path
     found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit, about=file)
+    found = state.root.shown(found)
     return found | {"path": path}

@@ -7,11 +7,13 @@ from itertools import accumulate
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
+from starlette.concurrency import run_in_threadpool
 
+from ..jobs.records import Deletion
 from ..jobs.states import State
 from ..jobs.store import Job, JobStore
 from ..planning import check_job
-from ..tidying import delete_folder
+from ..tidying import delete_files
 from .asking import OwnJob, Who
 from .models import After, Deleted, JobDetail, JobId, JobList, JobRecord, Label, Log, LogLine, NewJob, NewLabel, errors
 
@@ -26,9 +28,8 @@ async def submit_job(new: NewJob, request: Request, response: Response, who: Who
     """Queue a job, after the checks that a run makes before it starts: the movie opens, and the settings fit it."""
     state = request.app.state
     settings, output, _ = await check_job(state, who.name, new.source, new.settings, new.output)
-    job: Job = state.store.submit(
-        source=new.source, settings=settings, owner=who.name, label=new.label, output=output, curate=new.curate
-    )
+    about = {"source": new.source, "owner": who.name, "label": new.label, "output": output, "curate": new.curate}
+    job: Job = await run_in_threadpool(state.store.submit, settings=settings, **about)
     state.runner.wake()
     response.headers["Location"] = str(request.url_for("read_job", job_id=job.id).path)
     return job
@@ -108,8 +109,8 @@ def delete_job(
 ) -> Deleted:
     """Delete a job that has ended, or waits; its files stay where they are, unless they are to go with it."""
     state = request.app.state
-    state.store.delete(own.id)
-    kept = delete_folder(state.root, state.store, own) if files else ""
+    state.store.delete(own.id, files=files)
+    kept = delete_files(state.root, state.store, Deletion(own.id, own.owner, own.output)) if files else ""
     return Deleted(id=own.id, files=files and not kept, kept=kept)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated, Any, Literal
 
 from fastapi import Path, Query
@@ -23,6 +24,8 @@ from .declarations import settings_schema
 MAX_ITEMS, MAX_DEPTH, MAX_TEXT = 20_000, 6, 4096
 """Values in the settings of a request, how deep they may be nested, and characters of one text."""
 
+_NOT_PLAIN = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+
 
 def plain_text(text: str) -> str:
     """Return ``text`` if it can be stored and shown.
@@ -32,7 +35,7 @@ def plain_text(text: str) -> str:
     ValueError
         Where it has control characters or halves of characters (lone surrogates).
     """
-    if any(ord(sign) < 32 or 0x7F <= ord(sign) < 0xA0 or 0xD800 <= ord(sign) < 0xE000 for sign in text):
+    if _NOT_PLAIN.search(text):
         raise ValueError("the text has control characters or halves of characters")
     return text
 
@@ -61,12 +64,17 @@ def plain_values(value: dict[str, Any]) -> dict[str, Any]:
     left, level = MAX_ITEMS, [("settings", value)]
     for _ in range(MAX_DEPTH):
         left -= len(level)
-        if left < 0:
+        if left < sum(_count(item) for _, item in level):
             raise ValueError(f"these are more than {MAX_ITEMS} values")
         level = [part for name, item in level for part in _parts(name, item)]
     if level:
         raise ValueError(f"{level[0][0]}: the values are nested more than {MAX_DEPTH} deep")
     return value
+
+
+def _count(value: Any) -> int:
+    """Return how many parts a value has; see :func:`_parts`."""
+    return len(value) * (1 + isinstance(value, dict)) if isinstance(value, dict | list) else 0
 
 
 def _parts(name: str, value: Any) -> list[tuple[str, Any]]:

@@ -182,6 +182,7 @@ def _as_json(value: Mapping[str, Any]) -> bytes:
 
 def to_records(columns: xr.Dataset) -> list[ColumnRecord]:
     """Return columns, one mapping each."""
+    flags = {status: flag_names(status) for status in np.unique(columns["status_ref"].to_numpy()).tolist()}
     numbers = columns["fit_ref"].to_numpy()[:, [AMPLITUDE, SIGMA_A, SIGMA_B]]
     fits = numbers.astype(object)
     fits[~np.isfinite(numbers)] = None
@@ -191,7 +192,7 @@ def to_records(columns: xr.Dataset) -> list[ColumnRecord]:
             x=x,
             y=y,
             kind=str(kind),
-            flags=flag_names(status),
+            flags=flags[status],
             amplitude=fit[0],
             sigma_a=fit[1],
             sigma_b=fit[2],

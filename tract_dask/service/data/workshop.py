@@ -9,6 +9,7 @@ process. A worker has a limit on its private memory; files that it maps do not c
 from __future__ import annotations
 
 import asyncio
+import gc
 import multiprocessing
 import os
 import pickle
@@ -31,6 +32,7 @@ from typing import Any, TypeVar
 
 from ...errors import ClusterError, TractError
 from ...forkserver import THREAD_VARIABLES
+from ...lazy import uncollected
 from .crashes import Blamed, CrashError, ExhaustedError, crash_of, crashed, exhausted, unending
 
 T = TypeVar("T")
@@ -41,6 +43,9 @@ _BYTES = 1 << 30
 
 _LEAST_BYTES = 512 << 20
 """A worker may always hold so much more than it does when it has started: the compilers of kernels need it."""
+
+_COLLECTED = (100_000, 20, 20)
+"""When garbage is looked for; as usual, half of the time of a long table would go into that."""
 
 _SHELF_BYTES = 64 << 20
 _END_S = 5.0
@@ -395,9 +400,13 @@ class _Worker:
 def _work(pipe: Connection, hiring: _Hiring) -> None:
     """Do what comes through the pipe until its other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to answer
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    for module in hiring.imported:
-        import_module(module)
+    os.environ.update(
+        dict.fromkeys(THREAD_VARIABLES, "1"), ARROW_DEFAULT_MEMORY_POOL="system"
+    )  # it reserves 1 GiB else
+    with uncollected():
+        for module in hiring.imported:
+            import_module(module)
+    gc.set_threshold(*_COLLECTED)
     limit = 0 if hiring.memory is None else _limit_memory(max(hiring.memory, _LEAST_BYTES))
     with suppress(EOFError, OSError):
         pipe.send(None)

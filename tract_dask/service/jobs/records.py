@@ -79,6 +79,15 @@ class Job:
 
 
 @dataclass(frozen=True)
+class Deletion:
+    """The files of a job that was deleted with them; ``output`` is relative to the data root."""
+
+    job_id: str
+    owner: str
+    output: str
+
+
+@dataclass(frozen=True)
 class JobEvent:
     """Something that happened to a job.
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from . import rows
 from .clock import utc_now
-from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError
+from .records import ConflictError, Deletion, Job, JobEvent, UnknownJobError, UnknownVersionError
 from .states import CURATABLE, RETRYABLE, State
 from .tables import JobStoreError, check_place, migrate, store_error
 
@@ -274,8 +274,13 @@ class JobStore:
                 db, job_id, State.QUEUED, f"goes on with {what}", {**rows.AFRESH, "columns_version": version}
             )
 
-    def delete(self, job_id: str) -> None:
-        """Forget a job, with all that is known of it here; its files stay.
+    def delete(self, job_id: str, *, files: bool = False) -> None:
+        """Forget a job, with all that is known of it here.
+
+        Parameters
+        ----------
+        files
+            Note that its files are to go, too: :meth:`deletions` tells of them until :meth:`end_deletion`.
 
         Raises
         ------
@@ -283,7 +288,11 @@ class JobStore:
             Where it runs.
         """
         with self.writing() as db:
-            rows.require(rows.read_job(db, job_id), frozenset(State) - {State.RUNNING}, "deleted")
+            rows.require(job := rows.read_job(db, job_id), frozenset(State) - {State.RUNNING}, "deleted")
+            if files:
+                db.execute(
+                    "INSERT INTO deletions (job_id, owner, output) VALUES (?, ?, ?)", (job_id, job.owner, job.output)
+                )
             db.execute("DELETE FROM jobs WHERE id = ?", (job_id,))
             db.execute("DELETE FROM events WHERE job_id = ?", (job_id,))
             rows.add_event(db, job_id, "deleted", {"id": job_id, "deleted": True})
@@ -292,6 +301,15 @@ class JobStore:
                 " (SELECT id FROM events WHERE kind = 'deleted' ORDER BY id DESC LIMIT 1 OFFSET ?)",
                 (KEPT_DELETIONS,),
             )
+
+    def deletions(self) -> list[Deletion]:
+        """Return the files of deleted jobs that are still to go."""
+        return [Deletion(**row) for row in self.connection().execute("SELECT job_id, owner, output FROM deletions")]
+
+    def end_deletion(self, job_id: str) -> None:
+        """Note that the files of a deleted job are gone, or are to stay."""
+        with self.writing() as db:
+            db.execute("DELETE FROM deletions WHERE job_id = ?", (job_id,))
 
     def events(self, after: int = 0, job_id: str | None = None, limit: int = 1000) -> list[JobEvent]:
         """Return what happened after the event ``after``, to one job or to all, oldest first."""

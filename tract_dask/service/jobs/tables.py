@@ -75,7 +75,15 @@ CREATE INDEX jobs_by_end ON jobs (ended);
 PRAGMA application_id = 1414676801;
 """
 
-MIGRATIONS = (_FIRST, _SECOND)
+_THIRD = """
+CREATE TABLE deletions (
+    job_id TEXT PRIMARY KEY,
+    owner TEXT NOT NULL,
+    output TEXT NOT NULL
+) WITHOUT ROWID
+"""
+
+MIGRATIONS = (_FIRST, _SECOND, _THIRD)
 """The steps from each version to the next; a file's version is how many of them it has had."""
 
 _TABLES = frozenset({"jobs", "transitions", "events", "columns", "owners"})

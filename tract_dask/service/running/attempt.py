@@ -12,7 +12,7 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from queue import Empty, Queue
 from threading import Event, Thread
 from time import monotonic
@@ -147,6 +147,7 @@ class Attempt(Thread):
         except Exception as error:  # noqa: BLE001  the last resort: no job may stay behind as running
             _log.exception("job %s", self._job.id)
             end = Ending(State.FAILED, f"unexpected {type(error).__name__}: {error}")
+        end = replace(end, reason=self._root.shown(end.reason))
         if end.reason and end.state in (State.QUEUED, State.FAILED):
             self._store.log(self._job.id, "error" if end.state == State.FAILED else "warning", end.reason)
         self._store.change(self._job.id, end.state, end.reason, **end.fields)
@@ -180,7 +181,7 @@ class Attempt(Thread):
                 seal(self._root, self._mark)
         if code and self._said.outcome is None and not self._is_ending():
             for line in last_lines:
-                self._store.log(self._job.id, "error", line)
+                self._store.log(self._job.id, "error", self._root.shown(line))
         return self._ending(code)
 
     def _order(self) -> dict[str, Any]:
@@ -258,7 +259,8 @@ class Attempt(Thread):
                 self._store.workers(self._job.id, seen)
 
     def _take(self, record: dict[str, Any]) -> None:
-        job_id = self._job.id
+        """Note what the process says; paths of the data root end here."""
+        record, job_id = self._root.shown(record), self._job.id
         match record["kind"]:
             case "stage":
                 self._store.stage(job_id, record["stage"])

@@ -12,6 +12,7 @@ from ..config import ServiceConfig
 from ..jobs.clock import utc_now
 from ..jobs.states import State
 from ..jobs.store import Job, JobStore
+from ..tidying import finish_deletions
 from .attempt import Attempt
 from .keeper import Keeper
 from .queue import next_job
@@ -57,6 +58,7 @@ class Runner:
         self._held.enter_context(sole_use(lock, "another service works on this data root", patience_s=5.0))
         self._stopping.clear()
         self._recover("the service had been killed")
+        Thread(target=finish_deletions, args=(self._root, self._store), name="tidying", daemon=True).start()
         self.keeper.start()
         self._thread = Thread(target=self._loop, name="runner", daemon=True)
         self._thread.start()
