@@ -32,7 +32,7 @@ ALLOWED = {
     "damage": {"errors", "small_files"},
     "shards": set(),
     "journal": {"disk", "errors", "shard_files", "shards", "stores"},
-    "tries": {"errors"},
+    "tries": {"errors", "progress"},
     "deaths": set(),
     "dispatch": {"deaths", "errors", "journal", "shards", "tries"},
     "tasks": {"dispatch", "errors", "journal", "progress", "shards", "tries"},

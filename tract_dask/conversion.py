@@ -432,8 +432,10 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
     """
     try:
         present = stores.attributes(path)
-    except StoreError:  # --overwrite replaces it
-        return False
+    except StoreError as error:
+        if stores.is_of_system(error):
+            raise
+        return False  # --overwrite replaces it
     ours = stores.format_of(present) == stores.FORMAT  # shards of an older format do not go with ours
     if present.get("kind") != "movie" or present.get("key") != key or present.get("complete") or not ours:
         return False
@@ -443,6 +445,8 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
     try:
         stores.check_nodes(path, present, AXES)
     except StoreError as error:
+        if stores.is_of_system(error):
+            raise
         on_event(Warned(f"{error.where} is damaged: the conversion, which was interrupted, begins anew"))
         return False
     return True
