@@ -77,7 +77,7 @@ ALLOWED = {
     "verify": STORES | {"conversion", "locks", "parts", "shard_files"},
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},
-    "pipeline": STAGES | {"cluster", "locks", "report", "stages", "tls"},
+    "pipeline": STAGES | {"cluster", "locks", "report", "stages", "tls", "tries"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "editor": RUN | {"service"},
@@ -88,7 +88,7 @@ ALLOWED = {
     "certificates": {"errors"},
     "service": RUN
     | {"parts", "analysis", "certificates", "deaths", "describe", "export", "forkserver", "lazy", "locks"}
-    | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "web"},
+    | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "tries", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},

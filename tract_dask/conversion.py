@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from . import disk, schema, stores
 from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError, StoreError
-from .io import FrameSource, SourceMetadata, open_source
-from .io.source import Source, reading
+from .io import FrameSource, Permit, SourceMetadata, open_source
+from .io.source import Source, check_permitted, reading
 from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .keyed import counted, default_of
@@ -117,7 +117,7 @@ def convert(
             values[shard.start : shard.stop] = payload[name]
 
     origin = origin_of(movie)
-    job = _Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps)
+    job = _Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps, movie.permit)
     with _unchanged(path, movie, origin):
         stream_shards(
             partial(_convert_shard, job),
@@ -463,6 +463,7 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
     """
     try:
         yield
+        check_permitted(source.permit, source.files)
         origin.stamps.check(source.files)
         if _content(source) != origin.content:
             raise changed(source.path, "what it held then", "something else")
@@ -470,6 +471,7 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
         _clear(path)
         raise
     except Exception:
+        check_permitted(source.permit, source.files)
         try:
             origin.stamps.check(source.files)
         except ChangedSourceError:
@@ -489,18 +491,26 @@ class _Job:
     layout: Layout
     codec: str
     stamps: Stamps
+    permit: Permit | None = None
 
 
 @lru_cache(maxsize=4)
-def _opened(source: str | tuple[str, ...], settings: SourceSettings, stamps: str) -> FrameSource:
+def _opened(source: str | tuple[str, ...], settings: SourceSettings, permit: Permit | None, stamps: str) -> FrameSource:
     """Open the source once in a process; ``stamps`` tells it from another one later at the same place."""
-    return open_source(source, settings)
+    return open_source(source, settings, permit=permit)
+
+
+def _check_files(job: _Job, source: FrameSource, shard: Shard) -> None:
+    """Check that the files of a shard may be opened, and are as they were; in this order, which tells less."""
+    part = source.files_of(shard.start, shard.stop)
+    check_permitted(job.permit, source.files[part])
+    job.stamps.check(source.files, part)
 
 
 def _convert_shard(job: _Job, shard: Shard) -> Payload:
     """Read the frames of a shard, measure and bin them, write them; return their statistics."""
-    source = _opened(job.source, job.source_settings, job.stamps.digest)
-    check = partial(job.stamps.check, source.files, source.files_of(shard.start, shard.stop))
+    source = _opened(job.source, job.source_settings, job.permit, job.stamps.digest)
+    check = partial(_check_files, job, source, shard)
     check()
     found, expected = (f"shape {it.shape}, {it.dtype}" for it in (source, job.layout))
     if found != expected:
