@@ -25,7 +25,9 @@ Permit: TypeAlias = Callable[[Path], object]
 
 def check_permitted(permit: Permit | None, files: Sequence[Path]) -> None:
     """Ask once more whether files may be opened: a link among them may lead elsewhere now."""
-    for file in files if permit is not None else ():
+    if permit is None:
+        return
+    for file in files:
         permit(Path(os.path.realpath(file)))
 
 
