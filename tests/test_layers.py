@@ -32,7 +32,7 @@ ALLOWED = {
     "damage": {"errors", "small_files"},
     "shards": set(),
     "journal": {"disk", "errors", "shard_files", "shards", "stores"},
-    "tries": {"errors"},
+    "tries": {"errors", "progress"},
     "deaths": set(),
     "dispatch": {"deaths", "errors", "journal", "shards", "tries"},
     "tasks": {"dispatch", "errors", "journal", "progress", "shards", "tries"},
@@ -80,7 +80,7 @@ ALLOWED = {
     "web": set(),
     "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},
     "inputs": STAGES | {"cluster", "vacuum"},
-    "pipeline": STAGES | {"cluster", "inputs", "locks", "report", "stages", "tls"},
+    "pipeline": STAGES | {"cluster", "inputs", "locks", "report", "stages", "tls", "tries"},
     "describe": RUN,
     "demo": RUN | {"simulate"},
     "editor": RUN | {"service"},
@@ -91,7 +91,7 @@ ALLOWED = {
     "certificates": {"errors"},
     "service": RUN
     | {"parts", "analysis", "certificates", "deaths", "describe", "export", "forkserver", "lazy", "locks"}
-    | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "web"},
+    | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "tries", "web"},
     "client": {"errors", "results", "service", "settings"},
     "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
     "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},

@@ -10,15 +10,18 @@ import pytest
 from fastapi.testclient import TestClient
 from serviced import FRAMES, make_app, make_root
 
+from tract_dask import stores
 from tract_dask.conversion import convert
 from tract_dask.errors import MissingSourceError, TractError
-from tract_dask.io import FileList
+from tract_dask.io import FileList, open_source
+from tract_dask.progress import ShardDone, StageStarted
 from tract_dask.service.folders import Bounds, DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.outputs import Mark
 from tract_dask.service.running.attempt import Attempt
 from tract_dask.service.running.orders import Reporter, run_order
 from tract_dask.settings import RunSettings, to_dict
+from tract_dask.stamps import Stamps
 
 URL = "http://127.0.0.1:8000/api/v1"
 SHAPE = (4, 48, 40)
@@ -294,3 +297,30 @@ def test_bounds_are_equal_where_they_mean_the_same(tmp_path):
         with pytest.raises(OutsideError):
             first(tmp_path / name)
     first(tmp_path / "statement")
+
+
+@pytest.mark.parametrize(("kind", "event"), [("file", ShardDone), *((kind, StageStarted) for kind in ("file", *KINDS))])
+def test_the_tasks_of_a_job_look_again_where_links_lead(root, monkeypatch, kind, event):
+    """A link is turned after the job's process has looked; what the file system says of the files is hidden."""
+    name = turned(root, kind, write_target(root / "inside"))
+    monkeypatch.setattr(Stamps, "check", lambda *_: None)
+
+    def turn(met: object) -> None:
+        if isinstance(met, event):
+            turned(root, kind, write_target(root.parent / "outside"))
+
+    source = open_source(root / name, permit=DataRoot(root).permit)
+    with pytest.raises(OutsideError, match="leads out of the data root"):
+        convert(source, root / "movie.zarr", on_event=turn)
+    assert bool(list((root / "movie.zarr" / "0").glob("c.*"))) == (event is ShardDone)
+    assert not stores.attributes(root / "movie.zarr")["complete"]
+
+
+def turned(root: Path, kind: str, target: Path) -> str:
+    """Let a movie lead to the files of a folder; return what to open."""
+    if kind != "file":
+        return write_link(root / "turned.h5", kind, target)
+    np.save(target / "frames.npy", np.zeros(SHAPE, np.uint8))
+    (root / "turned.npy").unlink(missing_ok=True)
+    (root / "turned.npy").symlink_to(target / "frames.npy")
+    return "turned.npy"

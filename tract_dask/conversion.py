@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from . import disk, schema, stores
 from .errors import ChangedSourceError, DestinationError, MissingSourceError, SourceError, StoreError
-from .io import FrameSource, SourceMetadata, files_named_now, open_source
-from .io.source import Source, reading
+from .io import FrameSource, Permit, SourceMetadata, files_named_now, open_source
+from .io.source import Source, check_permitted, reading
 from .journal import Journal, Payload, journal_beside, remove_journal
 from .kernels.binning import FrameMeter
 from .keyed import counted, default_of
@@ -118,7 +118,7 @@ def convert(
             values[shard.start : shard.stop] = payload[name]
 
     origin = origin_of(movie)
-    job = _Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps)
+    job = _Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps, movie.permit)
     with _unchanged(path, movie, origin):
         stream_shards(
             partial(_convert_shard, job),
@@ -436,8 +436,10 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
     """
     try:
         present = stores.attributes(path)
-    except StoreError:  # --overwrite replaces it
-        return False
+    except StoreError as error:
+        if stores.is_of_system(error):
+            raise
+        return False  # --overwrite replaces it
     ours = stores.format_of(present) == stores.FORMAT  # shards of an older format do not go with ours
     if present.get("kind") != "movie" or present.get("key") != key or present.get("complete") or not ours:
         return False
@@ -447,6 +449,8 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
     try:
         stores.check_nodes(path, present, AXES)
     except StoreError as error:
+        if stores.is_of_system(error):
+            raise
         on_event(Warned(f"{error.where} is damaged: the conversion, which was interrupted, begins anew"))
         return False
     return True
@@ -463,6 +467,7 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
     """
     try:
         yield
+        check_permitted(source.permit, source.files)
         origin.stamps.check(source.files)
         _check_names(source)
         if _content(source) != origin.content:
@@ -471,6 +476,7 @@ def _unchanged(path: Path, source: FrameSource, origin: Origin) -> Iterator[None
         _clear(path)
         raise
     except Exception:
+        check_permitted(source.permit, source.files)
         try:
             origin.stamps.check(source.files)
         except ChangedSourceError:
@@ -508,18 +514,26 @@ class _Job:
     layout: Layout
     codec: str
     stamps: Stamps
+    permit: Permit | None = None
 
 
 @lru_cache(maxsize=4)
-def _opened(source: str | tuple[str, ...], settings: SourceSettings, stamps: str) -> FrameSource:
+def _opened(source: str | tuple[str, ...], settings: SourceSettings, permit: Permit | None, stamps: str) -> FrameSource:
     """Open the source once in a process; ``stamps`` tells it from another one later at the same place."""
-    return open_source(source, settings)
+    return open_source(source, settings, permit=permit)
+
+
+def _check_files(job: _Job, source: FrameSource, shard: Shard) -> None:
+    """Check that the files of a shard may be opened, and are as they were; in this order, which tells less."""
+    part = source.files_of(shard.start, shard.stop)
+    check_permitted(job.permit, source.files[part])
+    job.stamps.check(source.files, part)
 
 
 def _convert_shard(job: _Job, shard: Shard) -> Payload:
     """Read the frames of a shard, measure and bin them, write them; return their statistics."""
-    source = _opened(job.source, job.source_settings, job.stamps.digest)
-    check = partial(job.stamps.check, source.files, source.files_of(shard.start, shard.stop))
+    source = _opened(job.source, job.source_settings, job.permit, job.stamps.digest)
+    check = partial(_check_files, job, source, shard)
     check()
     found, expected = (f"shape {it.shape}, {it.dtype}" for it in (source, job.layout))
     if found != expected:

@@ -104,18 +104,27 @@ def place_now(aside: Path, path: Path) -> None:
 
 def place_folder(aside: Path, path: Path) -> None:
     """Put a folder of small files in its place, where there is none: every file synced, then the folder renamed."""
-    files = [Path(folder, name) for folder, _, names in os.walk(aside) for name in names]
-    sync_all(files)
-    sync_all([Path(folder) for folder, _, _ in os.walk(aside)])
+    walked = _walk(aside)
+    sync_all([folder / name for folder, names in walked for name in names])
+    sync_all([folder for folder, _ in walked])
     aside.replace(path)
     sync(path.parent)
 
 
 def sync_folders(store: Path, small: Collection[str] = ()) -> None:
     """Sync the names in every folder of a store, and the files of its ``small`` arrays, before it is complete."""
-    walked = [(Path(folder), names) for folder, _, names in os.walk(store)]
+    walked = _walk(store)
     sync_all([folder / name for folder, names in walked if folder.name in small for name in names])
     sync_all([folder for folder, _ in walked])
+
+
+def _walk(top: Path) -> list[tuple[Path, list[str]]]:
+    """Return every folder from ``top`` down, each with the names of its files; :func:`os.walk` leaves out errors."""
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    return [(Path(folder), names) for folder, _, names in os.walk(top, onerror=fail)]
 
 
 def append(path: Path, data: bytes) -> None:

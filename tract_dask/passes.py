@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 import uuid
 from collections.abc import Sequence
@@ -20,10 +21,13 @@ from .errors import StoreError
 from .journal import Fields, Journal, Payload
 from .movie import Movie
 from .progress import ShardDone, Sink, StageDone, StageStarted
-from .shard_files import checksum, unchecked
+from .shard_files import CHECKSUM_BYTES, crc32c, unchecked
 from .shards import Shard
 from .stores import disk_errors, sole_parser
 from .tasks import run_shards
+
+_HEAD_BYTES = 1 << 16
+"""The head of a .npy file, at most."""
 
 
 class DamagedArrayError(StoreError):
@@ -84,13 +88,15 @@ class Passes:
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array as .npy, and behind it a checksum of all: beside its place first, then synced and renamed."""
-    data = io.BytesIO()
-    np.save(data, array)
+    pixels: Any = np.asarray(array, order="C")
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(pixels))
+    checksum = crc32c(pixels, crc32c(head.getbuffer())).to_bytes(CHECKSUM_BYTES, "little")
     aside = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.partial")
     with disk_errors(path):
         try:
             with aside.open("wb") as file:
-                file.writelines((data.getbuffer(), checksum(data.getbuffer())))
+                file.writelines((head.getbuffer(), pixels.reshape(-1).view(np.uint8), checksum))
             disk.place(aside, path)
         except BaseException:
             aside.unlink(missing_ok=True)
@@ -106,7 +112,9 @@ def load_saved(path: Path) -> NDArray[Any]:
         Where it is missing, or damaged; it is then removed, so that no journal takes it for done.
     """
     try:
-        data = unchecked(memoryview(path.read_bytes()))
+        with path.open("rb") as file:
+            stored: Any = np.empty(os.fstat(file.fileno()).st_size, np.uint8)
+            data = unchecked(memoryview(stored)[: file.readinto(stored)])
     except (FileNotFoundError, ValueError) as error:
         with suppress(OSError):
             path.unlink(missing_ok=True)
@@ -117,6 +125,9 @@ def load_saved(path: Path) -> NDArray[Any]:
             str(error),
             "Run the same command again: it is made anew",
         ) from error
+    head = io.BytesIO(data[:_HEAD_BYTES])
+    np.lib.format.read_magic(head)
     with sole_parser():
-        array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(head)
+    array: NDArray[Any] = np.frombuffer(data, dtype, offset=head.tell()).reshape(shape)
     return array

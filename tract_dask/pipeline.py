@@ -6,8 +6,10 @@ import dataclasses
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain, repeat
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
@@ -47,6 +49,7 @@ from .settings import ClusterSettings, RunSettings, to_toml
 from .shards import split
 from .stages import check_edited, clear_columns, columns_stage, convert_stage, drift_stage, fit_stage, sum_stage
 from .tls import open_to_others
+from .tries import Done, persist
 
 WORKER_BYTES = 300_000_000
 """What a worker process takes before it has read a pixel."""
@@ -270,17 +273,20 @@ def run(
     settings = _absolute(settings or RunSettings())
     outputs = Outputs(Path(output).absolute())
     _check_stage(until)
-    with closing(_open(source, settings, None if overwrite else outputs.movie, permit)) as opened:
-        check_inputs(opened.shape, settings)
+    attempt = partial(persist, send=on_event, file=str(outputs.root))
+    opening = partial(_open, source, settings, None if overwrite else outputs.movie, permit)
+    with closing(attempt(opening)) as opened:
+        attempt(partial(check_inputs, opened.shape, settings))
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, _expected_limit(settings, client))
             return RunOutcome(outputs, plan, "planned", plan.frames)
-        check_output(outputs, opened, settings, overwrite=overwrite)
-        with sole_run(outputs, patience_s):
+        attempt(partial(check_output, outputs, opened, settings, overwrite=overwrite))
+        with ExitStack() as stack:
+            attempt(lambda: stack.enter_context(sole_run(outputs, patience_s)))
             if overwrite:
-                same = stores.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened)
-                clear_run(outputs, on_event, keep_edited=same)
-            check_edited(outputs.columns, settings.columns, opened.shape[1:])
+                same = attempt(lambda: stores.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened))
+                attempt(partial(clear_run, outputs, on_event, keep_edited=same))
+            attempt(partial(check_edited, outputs.columns, settings.columns, opened.shape[1:]))
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -295,12 +301,15 @@ def run_convert(
 ) -> Movie:
     """Convert a movie to the store ``destination``; the first stage of :func:`run`, alone."""
     settings, path = _absolute(settings or RunSettings()), Path(destination).absolute()
-    with closing(_open(source, settings, None if overwrite else path)) as opened:
+    opening = partial(_open, source, settings, None if overwrite else path)
+    with closing(persist(opening, on_event, str(source))) as opened:
         plan = plan_run(opened.shape, opened.dtype, settings)
         if overwrite and stores.is_sound(path) and stores.attributes(path).get("kind") == "movie":
             stores.remove(path)  # also the very movie that would be made: a shard of it may be damaged
         with _Session(opened.path, path, settings.cluster, client, on_event, plan) as session:
-            return convert_stage(opened, path, settings, session.workers, session.send, overwrite=overwrite)
+            return session.attempt(
+                partial(convert_stage, opened, path, settings, session.workers, session.send, overwrite=overwrite)
+            )
 
 
 def run_drift(
@@ -315,7 +324,7 @@ def run_drift(
     settings, path, opened = _absolute(settings or RunSettings()), Path(output).absolute(), open_movie(movie)
     check_drift(opened.n_frames, settings.drift)
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
-        return drift_stage(opened, path, settings.drift, session.workers, session.send)
+        return session.attempt(partial(drift_stage, opened, path, settings.drift, session.workers, session.send))
 
 
 def run_columns(
@@ -335,8 +344,9 @@ def run_columns(
     check_edited(path, settings.columns, opened.shape[1:])
     shift = None if drift is None else stores.open_dataset(Path(drift))
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
-        summed = sum_stage(opened, shift, sum_beside(path), session.workers, session.send)
-        return columns_stage(summed, path, settings.columns, settings.fit, session.send, overwrite=overwrite)
+        attempt, send = session.attempt, session.send
+        summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), session.workers, send))
+        return attempt(partial(columns_stage, summed, path, settings.columns, settings.fit, send, overwrite=overwrite))
 
 
 def run_fit(
@@ -359,10 +369,12 @@ def run_fit(
     check_fit(opened.shape[1:], settings.fit, drift_of(shift, opened.n_frames))
     check_pixels_of(opened, settings.fit)
     with _Session(str(movie), path, settings.cluster, client, on_event) as session:
-        summed = sum_stage(opened, shift, sum_beside(path), session.workers, session.send)
-        found = columns_stage(summed, path.with_name(f"{path.stem}_columns.csv"), chosen, settings.fit, session.send)
+        attempt, workers, send = session.attempt, session.workers, session.send
+        summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), workers, send))
+        csv = path.with_name(f"{path.stem}_columns.csv")
+        found = attempt(partial(columns_stage, summed, csv, chosen, settings.fit, send))
         refine = _refine_columns(settings)
-        return fit_stage(opened, found, shift, summed, path, settings.fit, refine, session.workers, session.send)
+        return attempt(partial(fit_stage, opened, found, shift, summed, path, settings.fit, refine, workers, send))
 
 
 def _run(
@@ -380,7 +392,7 @@ def _run(
     send = tee((record, JsonLines(outputs.events, on_event), on_event))
     plan = plan_run(source.shape, source.dtype, settings)
     with _Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
-        stores.write_aside(outputs.settings, _run_toml(settings, {}).encode())
+        session.attempt(partial(stores.write_aside, outputs.settings, _run_toml(settings, {}).encode()))
         for stage in _stages(source, outputs, settings, session, made):
             if stage == until:
                 break
@@ -388,13 +400,11 @@ def _run(
         if made.movie is None or made.summary is None:
             session.state = "stopped"
         else:
-            stores.write_aside(
-                outputs.settings, _run_toml(settings, _resolved(made.movie, made.columns, outputs)).encode()
-            )
+            session.attempt(partial(_complete_toml, outputs, settings, made.movie, made.columns))
             session.state = "done_with_bad_frames" if made.summary.bad_frames else "done"
             session.message = "" if record.seconds else "all was done before: nothing to do"
             if report:
-                _report(outputs, send)
+                _report(outputs, session)
     summary = made.summary or FitSummary(0, 0, 0)
     return RunOutcome(
         outputs,
@@ -423,34 +433,42 @@ def _stages(
     source: FrameSource, outputs: Outputs, settings: RunSettings, session: _Session, made: _Made
 ) -> Iterator[str]:
     """Run the stages one by one; yield the name of each when it is done."""
-    workers, send = session.workers, session.send
-    made.movie = movie = convert_stage(source, outputs.movie, settings, workers, send)
-    check_pixels_of(movie, settings.fit)
+    attempt, workers, send = session.attempt, session.workers, session.send
+    made.movie = movie = attempt(partial(convert_stage, source, outputs.movie, settings, workers, send))
+    attempt(partial(check_pixels_of, movie, settings.fit))
     yield "convert"
-    drift = drift_stage(movie, outputs.drift, settings.drift, workers, send)
+    drift = attempt(partial(drift_stage, movie, outputs.drift, settings.drift, workers, send))
     check_fit(movie.shape[1:], settings.fit, drift["drift"].to_numpy())
     yield "drift"
-    summed = sum_stage(movie, drift, outputs.sum, workers, send)
+    summed = attempt(partial(sum_stage, movie, drift, outputs.sum, workers, send))
     yield "sum"
     session.finish_aside()  # it imports what comes next: two threads could meet in packages that import each other
-    columns = columns_stage(summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
-    made.columns = columns
+    found = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
+    made.columns = columns = attempt(found)
     yield "columns"
     refine = _refine_columns(settings)
-    made.summary = fit_stage(movie, columns, drift, summed, outputs.results, settings.fit, refine, workers, send)
+    made.summary = attempt(
+        partial(fit_stage, movie, columns, drift, summed, outputs.results, settings.fit, refine, workers, send)
+    )
     yield "fit"
 
 
-def _report(outputs: Outputs, send: Sink) -> None:
+def _complete_toml(outputs: Outputs, settings: RunSettings, movie: Movie, columns: xr.Dataset) -> None:
+    """Write the settings once more, with what the data gave for those that were unset."""
+    stores.write_aside(outputs.settings, _run_toml(settings, _resolved(movie, columns, outputs)).encode())
+
+
+def _report(outputs: Outputs, session: _Session) -> None:
     """Write the report, if there is none of these tracks; whatever goes wrong, the tracks are done."""
     from .report import is_current, write_report  # takes its time to import
 
+    send = session.send
     send(StageStarted(REPORT, 0))
     began, current = perf_counter(), False
     try:
-        current = is_current(outputs.root)
+        current = session.attempt(partial(is_current, outputs.root))
         if not current:
-            write_report(outputs.root, figures=False)
+            session.attempt(partial(write_report, outputs.root, figures=False))
     except Exception as error:  # noqa: BLE001  nothing in a page of figures may undo a finished run
         stores.remove(outputs.report)  # it would be of other tracks
         send(Warned(f"the report could not be made: {error}"))
@@ -474,18 +492,33 @@ class _Session:
     ) -> None:
         self._started, self._plan, self._began = RunStarted(source, str(output)), plan, perf_counter()
         self._is_given = client is not None
-        self.workers, self.send = LazyClient(cluster, client, self._on_connect), send
+        self.workers, self._sink = LazyClient(cluster, client, self._on_connect), send
+        self._refusal: OSError | None = None
         self.state, self.message = "done", ""
-        self._thread, self._asides = ThreadPoolExecutor(1, "aside"), list[Future[object]]()
+        self._thread, self._asides = ThreadPoolExecutor(1, "aside"), list[tuple[Callable[[], object], Future[object]]]()
+
+    def send(self, event: Event) -> None:
+        """Send an event to the sink; what that raises ends the job."""
+        try:
+            self._sink(event)
+        except OSError as error:
+            self._refusal = error
+            raise
+
+    def attempt(self, work: Callable[[], Done]) -> Done:
+        """Do some work, again where this process meets an error that may pass; see :func:`tract_dask.tries.persist`."""
+        return persist(work, self.send, self._started.output, lambda error: error is self._refusal)
 
     def aside(self, work: Callable[[], object]) -> None:
         """Let the thread do some work."""
-        self._asides.append(self._thread.submit(work))
+        self._asides.append((work, self._thread.submit(work)))
 
     def finish_aside(self) -> None:
-        """Wait for the thread; raise what went wrong in it."""
-        for future in self._asides:
-            future.result()
+        """Wait for the thread; do here what met an error there that may pass, raise other errors."""
+        for work, future in self._asides:
+            tries = chain([future.result], repeat(work))
+            self.attempt(partial(_do_next, tries))
+        self._asides.clear()
 
     def __enter__(self) -> _Session:
         self.send(self._started)
@@ -514,6 +547,10 @@ class _Session:
         if not self._is_given and (warning := open_to_others(client.scheduler.address)):
             self.send(Warned(warning))
         self.aside(_get_ready)
+
+
+def _do_next(works: Iterator[Callable[[], object]]) -> object:
+    return next(works)()
 
 
 class _Record:

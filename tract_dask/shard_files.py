@@ -82,15 +82,15 @@ def codecs(codec: str) -> list[dict[str, Any]]:
     return [*blosc, {"name": "crc32c"}]
 
 
-def crc32c(data: Any) -> int:
-    """Return the CRC-32C of contiguous bytes, or of an array's.
+def crc32c(data: Any, before: int = 0) -> int:
+    """Return the CRC-32C of contiguous bytes, or of an array's; ``before`` is that of the bytes before them.
 
     Examples
     --------
     >>> hex(crc32c(b"123456789"))
     '0xe3069283'
     """
-    return int(google_crc32c.value(np.frombuffer(data, np.uint8)))
+    return int(google_crc32c.extend(before, np.frombuffer(data, np.uint8)))
 
 
 def checksum(data: Any) -> bytes:

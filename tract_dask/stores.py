@@ -486,11 +486,12 @@ def _readable(size: int) -> str:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn a full disk or a refused write inside this block into a StoreError that says so."""
+    """Turn a full disk or a refused write inside this block into a StoreError; other errors of the system name it."""
     try:
         yield
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS):
+            error.filename = error.filename or str(path)
             raise
         raise StoreError(
             "writing failed",

@@ -1,23 +1,29 @@
-"""What is tried again: errors of a machine that may pass, and how often and where a shard is tried."""
+"""What is tried again: errors of a machine that may pass, and how often and where a shard or a stage is tried."""
 
 from __future__ import annotations
 
 import errno
 import os
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from time import sleep
+from typing import TypeVar
 
 import dask
+from distributed.comm import CommClosedError
 from distributed.worker import get_worker
 
-from .errors import StoreError, TractError
+from .errors import ClusterError, StoreError, TractError
+from .progress import Sink, Warned
 
 RETRY = "tract_dask.retry-s"
-"""Item of Dask's configuration: the wait before the second try of a shard, in s; each next one is twice as long."""
+"""Item of Dask's configuration: the wait before the second try, in s; each next one is twice as long."""
+
+Done = TypeVar("Done")
 
 MOST_TRIES = 6
-"""So often a shard is tried, at least, before an error that may pass ends the work."""
+"""So often a shard is tried, at least, before an error that may pass ends the work; so often a stage is."""
 
 ROW = 3
 """A worker with so many failures in a row, while others succeed, is left out; also: so many hosts have to fail."""
@@ -156,6 +162,44 @@ def wait_s(tries: int) -> float:
     """
     first = float(dask.config.get(RETRY, _RETRY_S))
     return first * float(min(2 ** (tries - 1), _LONGEST_WAIT))
+
+
+def persist(
+    work: Callable[[], Done], send: Sink, file: str, is_final: Callable[[Exception], bool] = lambda error: False
+) -> Done:
+    """Do what can be done again, once more wherever this process meets an error that may pass; return what it returns.
+
+    What tasks meet is tried again shard by shard, and comes here as an error that is final.
+
+    Parameters
+    ----------
+    send
+        Takes a warning before each wait.
+    file
+        To be named where an error names none.
+    is_final
+        Tells errors that end the work though they look as if they could pass.
+
+    Raises
+    ------
+    TractError
+        Where an error has not passed in :data:`MOST_TRIES` tries. Others are raised as they are.
+    """
+    tries = 1
+    while True:
+        try:
+            return work()
+        except (ClusterError, CommClosedError):
+            raise
+        except Exception as error:
+            met = None if is_final(error) else trouble(error, Place(), file)
+            if met is None or not met.passes or met.number == errno.EAGAIN:  # somebody else's lock
+                raise
+            if tries == MOST_TRIES:
+                raise met.error from error
+        send(Warned(f"{met}; it is tried again in {wait_s(tries):g} s"))
+        sleep(wait_s(tries))
+        tries += 1
 
 
 def is_hopeless(troubles: Sequence[Trouble], workers: Collection[str]) -> bool:

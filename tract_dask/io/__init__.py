@@ -111,7 +111,7 @@ def open_source(
         notes=known.notes,
     )
     listed = tuple(place) if isinstance(place, list) else ()
-    return replace(source, path=name, metadata=merged, listed=listed)
+    return replace(source, path=name, metadata=merged, listed=listed, permit=permit)
 
 
 def open_cached(

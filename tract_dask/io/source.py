@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,14 @@ Frames: TypeAlias = NDArray[Any]
 
 Permit: TypeAlias = Callable[[Path], object]
 """Called with the resolved path of every file before it is opened; raises to refuse it."""
+
+
+def check_permitted(permit: Permit | None, files: Sequence[Path]) -> None:
+    """Ask once more whether files may be opened: a link among them may lead elsewhere now."""
+    if permit is None:
+        return
+    for file in files:
+        permit(Path(os.path.realpath(file)))
 
 
 @dataclass(frozen=True)
@@ -91,6 +99,10 @@ class FrameSource(Protocol):
     def listed(self) -> tuple[str, ...]:
         """The names of the list that the movie was opened by, of which ``path`` is the first; empty for one name."""
 
+    @property
+    def permit(self) -> Permit | None:
+        """What was asked before its files were opened, and is to be asked wherever they are opened anew."""
+
     def files_of(self, start: int, stop: int) -> slice:
         """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
 
@@ -119,6 +131,7 @@ class Source:
     metadata: SourceMetadata
     inside: str = ""
     listed: tuple[str, ...] = ()
+    permit: Permit | None = None
 
     @property
     def one_by_one(self) -> bool:

@@ -23,6 +23,7 @@ from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, silen
 from ...settings import RunSettings, from_dict
 from ...terminal import clock
 from ...tls import using
+from ...tries import persist
 from ..folders import DataRoot
 from ..outputs import Mark, claim
 from .timeline import Timeline
@@ -110,13 +111,13 @@ def run_order(order: dict[str, Any], on_event: Reporter) -> pipeline.RunOutcome:
     dask.config.set({JOB: order["job"]})
     settings = from_dict(RunSettings, {**order["settings"], "cluster": order["cluster"]})
     root, mark = DataRoot(Path(order["root"]), tuple(map(Path, order["closed"]))), Mark(**order["mark"])
-    claim(root, mark, PATIENCE_S)
+    persist(partial(claim, root, mark, PATIENCE_S), on_event, order["output"])
     outputs, columns = pipeline.Outputs(Path(order["output"])), order["columns"]
     run = partial(pipeline.run, _source(order), outputs.root, settings, patience_s=PATIENCE_S, permit=root.permit)
     if columns is not None:  # an edited table is one that differs from that of a finished stage
         sink = silent if outputs.columns.exists() else on_event
         run(on_event=sink, until="columns")
-        place_columns(outputs, columns)
+        persist(partial(place_columns, outputs, columns), on_event, order["output"])
     return run(on_event=on_event, until=order["until"])
 
 
