@@ -18,7 +18,7 @@ import zarr
 from distributed import Client
 from numpy.typing import NDArray
 
-from tract_dask.shards import Shard, split
+from tract_dask.store.shards import Shard, split
 
 Part: TypeAlias = tuple[slice, slice]
 """Rows and columns of a frame."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import psutil
 
-from tract_dask.cluster import connect
-from tract_dask.journal import Journal, Payload
+from tract_dask.cluster.connect import connect
+from tract_dask.cluster.tasks import run_shards
 from tract_dask.settings import ClusterSettings
-from tract_dask.shards import Shard, split
-from tract_dask.tasks import run_shards
+from tract_dask.store.journal import Journal, Payload
+from tract_dask.store.shards import Shard, split
 
 from .sizes import Size
 

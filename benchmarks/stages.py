@@ -18,12 +18,14 @@ from distributed import Client
 from numpy.typing import NDArray
 
 import tract_dask
-from tract_dask import drift, stores
-from tract_dask.cluster import connect
-from tract_dask.kernels.filters import gaussian_kernel
-from tract_dask.pipeline import Outputs, RunOutcome
+from tract_dask.cluster.connect import connect
+from tract_dask.kernels.blur import gaussian_kernel
+from tract_dask.run.pipeline import RunOutcome
 from tract_dask.settings import ClusterSettings, ColumnSettings, FitSettings, RunSettings
-from tract_dask.shards import split
+from tract_dask.stages.drift import measure
+from tract_dask.store import datasets, files, metadata
+from tract_dask.store.run_folder import RunFolder
+from tract_dask.store.shards import split
 
 from . import loops, movies
 from .sizes import Size
@@ -72,7 +74,7 @@ def finished_run(movie: Path, output: Path, settings: RunSettings, client: Clien
         shutil.rmtree(output, ignore_errors=True)
 
 
-def bare_loops(client: Client, movie: Path, outputs: Outputs, work: Path) -> dict[str, float]:
+def bare_loops(client: Client, movie: Path, outputs: RunFolder, work: Path) -> dict[str, float]:
     """Return how long the bare loops beside the stages of a finished run take, s."""
     frames, copy = outputs.movie / "0", work / "bare.zarr"
     tasks = {
@@ -88,19 +90,19 @@ def bare_loops(client: Client, movie: Path, outputs: Outputs, work: Path) -> dic
     return seconds
 
 
-def arrays_of_drift_and_sum(outputs: Outputs) -> list[Path]:
+def arrays_of_drift_and_sum(outputs: RunFolder) -> list[Path]:
     """Return what the drift and the sum stages read: a level in each of the drift's passes, then the frames."""
-    about = stores.attributes(outputs.movie)
+    about = metadata.attributes(outputs.movie)
     _, height, width = about["shape"]
-    fine = (bins for bins in (1, *about["bins"]) if (height // bins) * (width // bins) <= drift.LEVEL_PIXELS)
+    fine = (bins for bins in (1, *about["bins"]) if (height // bins) * (width // bins) <= measure.LEVEL_PIXELS)
     level = next(fine, about["bins"][-1])
     frames = outputs.movie / "0"
-    return [frames if level == 1 else outputs.movie / "binned" / str(level)] * len(drift.PASSES) + [frames]
+    return [frames if level == 1 else outputs.movie / "binned" / str(level)] * len(measure.PASSES) + [frames]
 
 
-def parts_of_fit(outputs: Outputs) -> list[list[loops.Part]]:
+def parts_of_fit(outputs: RunFolder) -> list[list[loops.Part]]:
     """Return the parts of the frames that the fit stage needs, shard by shard: its windows, and the vacuum."""
-    about, array = stores.attributes(outputs.results), stores.open_array(outputs.movie / "0")
+    about, array = metadata.attributes(outputs.results), datasets.open_array(outputs.movie / "0")
     tracks = tract_dask.open_results(outputs.results)
     places = np.stack([tracks["y_ref"].to_numpy(), tracks["x_ref"].to_numpy()], axis=1)
     margin = gaussian_kernel(FitSettings().blur_sigma_px).size // 2
@@ -120,7 +122,7 @@ def parts_of_fit(outputs: Outputs) -> list[list[loops.Part]]:
 
 
 def fit_sweep(
-    size: Size, movie: Path, outputs: Outputs, settings: RunSettings, client: Client
+    size: Size, movie: Path, outputs: RunFolder, settings: RunSettings, client: Client
 ) -> dict[int, list[float]]:
     """Return how long the fit stage takes with some of the columns of a finished run, s; its results are replaced."""
     tracks = tract_dask.open_results(outputs.results)
@@ -133,7 +135,7 @@ def fit_sweep(
     for _ in range(size.long_repeats):
         for count, table in tables.items():
             columns = ColumnSettings(method="csv", csv=str(table))
-            stores.remove(outputs.results)
+            files.remove(outputs.results)
             outcome = tract_dask.run(movie, outputs.root, dataclasses.replace(settings, columns=columns), client=client)
             times[count].append(outcome.seconds["fit"])
     return times

@@ -16,8 +16,8 @@ from .timing import ONE_THREAD, alternate, summary
 
 FIRST_FIT = """
 import numpy as np
-from tract_dask.kernels.fitting import fit_gaussians
-from tract_dask.kernels.gaussian import gaussian_image
+from tract_dask.kernels.gaussian.fit import fit_gaussians
+from tract_dask.kernels.gaussian.model import gaussian_image
 truth = np.array([100.0, 12.5, 11.5, 4.0, 3.0, 0.3, 20.0])
 windows = gaussian_image(truth[None], (25, 25)).astype(np.float32)
 fits = fit_gaussians(windows, truth * 1.05, truth - 50, truth + 50, blur_sigma_px=2.0)

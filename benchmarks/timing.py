@@ -8,7 +8,7 @@ from statistics import median
 from time import perf_counter
 from typing import Any, TypeVar
 
-from tract_dask.forkserver import THREAD_VARIABLES
+from tract_dask.cluster.forkserver import THREAD_VARIABLES
 
 Name = TypeVar("Name", bound=Hashable)
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tract_dask.kernels.gaussian import evaluate
-from tract_dask.kernels.information import column_bounds
+from tract_dask.kernels.gaussian.information import column_bounds
+from tract_dask.kernels.gaussian.model import evaluate
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,10 @@ import xarray as xr
 from hypothesis import settings
 from numba.core.dispatcher import Dispatcher
 
-from tract_dask import parts, results, schema
-from tract_dask.journal import Journal, journal_beside
-from tract_dask.shards import Shard, split
+from tract_dask.stages.fit import join
+from tract_dask.store import parts, results, schema
+from tract_dask.store.journal import Journal, journal_beside
+from tract_dask.store.shards import Shard, split
 
 settings.register_profile("checks", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("checks")
@@ -174,7 +175,7 @@ def add_fits(
 def store_fits(path: Path, values: dict[str, np.ndarray], step: int, key: str = "key") -> None:
     """Store the fits of all frames in the results at ``path``, which are complete then."""
     journal = add_fits(path, values, split(len(values["fit"]), step), step, key)
-    parts.join(path, journal)
+    join.join(path, journal)
     results.finish(path)
     journal.remove()
 

@@ -14,7 +14,7 @@ from benchmarks.fitters import LSQ, POISSON
 from benchmarks.peers.protocol import equation_1, slopes_1
 from benchmarks.sizes import SMALL
 from benchmarks.windows import Case, draw, score
-from tract_dask.kernels.gaussian import evaluate
+from tract_dask.kernels.gaussian.model import evaluate
 
 ROOT = Path(__file__).parents[1]
 PARAMETERS = np.array([60.0, 11.4, 12.7, 4.1, 2.8, 0.4, 20.0])

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tract_dask.settings import RunSettings
-from tract_dask.simulate import simulate_movie
+from tract_dask.simulate.movie import simulate_movie
 
 ROOT = Path(__file__).parents[1]
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"

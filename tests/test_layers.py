@@ -169,7 +169,7 @@ def test_every_room_of_the_table_is_there():
         ("from .io import open_source\nimport numpy.linalg", 0, {"io"}, {"numpy"}),
         ("from .source import Source\nfrom ..errors import TractError", 1, {"errors"}, set()),
         ("from .. import fit", 1, {"fit"}, set()),
-        ("import tract_dask.cli\nfrom tract_dask.movie import Movie", 0, {"cli", "movie"}, set()),
+        ("import tract_dask.cli.main\nfrom tract_dask.store.movie import Movie", 0, {"cli", "movie"}, set()),
         ("def f():\n    from .pipeline import run", 0, {"pipeline"}, set()),
     ],
 )

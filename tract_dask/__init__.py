@@ -8,26 +8,27 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from .lazy import lazy_names
-from .system import check_system
+from .cluster.forkserver import lazy_names
+from .errors import check_system
 
 if TYPE_CHECKING:
-    from .client import ServiceClient
-    from .columns import find_columns, lattice_columns
-    from .comparison import compare_filters
-    from .conversion import convert
-    from .detection import detect_columns, link_detections
-    from .dose import fit_doses, rebin_frames
-    from .drift import estimate_drift
-    from .editor import edit_columns
-    from .filtering import filter_frames
-    from .fit import fit_columns
-    from .io import open_source
-    from .movie import open_movie
-    from .pipeline import run
-    from .results import accepted, open_results
-    from .simulate import simulate_movie
-    from .summing import sum_image
+    from .analysis.dose import fit_doses, rebin_frames
+    from .analysis.filters import compare_filters
+    from .readers import open_source
+    from .run.pipeline import run
+    from .service.client import ServiceClient
+    from .service.notebook import edit_columns
+    from .simulate.movie import simulate_movie
+    from .stages.columns.detect import detect_columns, link_detections
+    from .stages.columns.find import find_columns
+    from .stages.columns.sites import lattice_columns
+    from .stages.convert.stage import convert
+    from .stages.drift.stage import estimate_drift
+    from .stages.fit.filters import filter_frames
+    from .stages.fit.lazy import fit_columns
+    from .stages.sum import sum_image
+    from .store.movie import open_movie
+    from .store.results import accepted, open_results
 
 __version__ = "0.1.0"
 

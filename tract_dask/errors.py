@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 _LONGEST = 200
 
 
@@ -105,3 +107,20 @@ class ClusterError(TractError):
 
 class ServiceError(TractError):
     """The service cannot be reached, or its answer cannot be understood."""
+
+
+def check_system() -> None:
+    """Check that this is not Windows, which lacks what workers and stores are built on (fork, pread, file locks).
+
+    Raises
+    ------
+    InputError
+        Where it is.
+    """
+    if sys.platform == "win32":
+        raise InputError(
+            "tract_dask does not run on Windows",
+            expected="Linux",
+            got="Windows",
+            remedy="Install and run it in WSL, the Linux inside Windows (wsl --install)",
+        )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from benchmarks.peers.protocol import Found, Task, serve
-from tract_dask.kernels.fitting import fit_gaussians
+from tract_dask.kernels.gaussian.fit import fit_gaussians
 
 TOLERANCE_PX = 1e-4
 

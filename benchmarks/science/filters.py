@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 import tract_dask as td
-from tract_dask.comparison import FILTERS
+from tract_dask.analysis.filters import FILTERS
 
 from .jumps import APPEARS, JUMPS, MOVIES, VANISHES
 from .scenes import Floats, moving_columns, open_scene

@@ -15,8 +15,8 @@ from tract_dask.analysis.intensity import vacuum_level
 from tract_dask.analysis.jumps import change_points, threshold_jumps
 from tract_dask.analysis.occupancy import count_atoms
 from tract_dask.analysis.presence import present, states
-from tract_dask.results import accepted
-from tract_dask.schema import Status
+from tract_dask.store.results import accepted
+from tract_dask.store.schema import Status
 
 from .scenes import moving_columns, open_scene, table_of
 from .tables import Table, with_error

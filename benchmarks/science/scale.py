@@ -16,11 +16,12 @@ import numpy as np
 import xarray as xr
 
 import tract_dask as td
-from tract_dask import parts, results, schema
-from tract_dask.journal import Journal, journal_beside
 from tract_dask.settings import FitSettings, to_toml
-from tract_dask.shards import Shard, split
-from tract_dask.simulate import ceo2_table
+from tract_dask.simulate.shipped import ceo2_table
+from tract_dask.stages.fit import join
+from tract_dask.store import parts, results, schema
+from tract_dask.store.journal import Journal, journal_beside
+from tract_dask.store.shards import Shard, split
 
 from .tables import Table
 
@@ -35,8 +36,8 @@ _ATOMS = 3
 
 def _analyses(path: Path) -> dict[str, Callable[[xr.Dataset], object]]:
     """Return what is measured: a name as users call it, and the call, all of whose result is computed."""
-    from tract_dask import export
     from tract_dask.analysis import intensity, jumps, mixtures, motion, occupancy, precision, presence
+    from tract_dask.export import tables
 
     vacuum = _DOSE * (_PIXEL_PM / 100) ** 2
     file = path.with_name("export")
@@ -75,10 +76,10 @@ def _analyses(path: Path) -> dict[str, Callable[[xr.Dataset], object]]:
         "`mixtures.mixture`": lambda t: mixtures.mixture(
             intensity.mean_intensity(t)["intensity"].isel(frame=0, drop=True).compute()
         ),
-        "`export` .csv": lambda t: export.export(t, file.with_suffix(".csv"), overwrite=True),
-        "`export` .parquet": lambda t: export.export(t, file.with_suffix(".parquet"), overwrite=True),
-        "`export` .nc": lambda t: export.export(t, file.with_suffix(".nc"), overwrite=True),
-        "`export` .mat": lambda t: export.export(t, file.with_suffix(".mat"), overwrite=True),
+        "`export` .csv": lambda t: tables.export(t, file.with_suffix(".csv"), overwrite=True),
+        "`export` .parquet": lambda t: tables.export(t, file.with_suffix(".parquet"), overwrite=True),
+        "`export` .nc": lambda t: tables.export(t, file.with_suffix(".nc"), overwrite=True),
+        "`export` .mat": lambda t: tables.export(t, file.with_suffix(".mat"), overwrite=True),
     }
 
 
@@ -142,7 +143,7 @@ def make(path: Path) -> None:
         with journal.batch() as done:
             parts.write(journal.path, shard, values, FRAMES_PER_SHARD)
             done(shard, {})
-    parts.join(path, journal)
+    join.join(path, journal)
     results.finish(path)
     journal.remove()
 

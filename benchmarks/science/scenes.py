@@ -24,10 +24,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import tract_dask as td
-from tract_dask.analysis.occupancy import look_up_table
-from tract_dask.movie import Movie
-from tract_dask.seeds import column_dataset, positions
+from tract_dask.analysis.lookup import look_up_table
 from tract_dask.settings import FitSettings, MetadataSettings
+from tract_dask.store.columns import column_dataset, positions
+from tract_dask.store.movie import Movie
 
 Floats = NDArray[np.float64]
 

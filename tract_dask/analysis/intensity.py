@@ -10,13 +10,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from .. import measure, schema
 from ..errors import SettingsError
-from ..movie import Movie
-from ..results import accepted
-from ..schema import AMPLITUDE, SIGMA_A, SIGMA_B
-from ..settings import FitSettings
-from ..vacuum import check_box, find_vacuum
+from ..kernels.gaussian.intensity import INTENSITY_SCALE, intensities
+from ..kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B
+from ..settings.run import FitSettings
+from ..stages.fit.vacuum import check_box, find_vacuum
+from ..store import schema
+from ..store.movie import Movie
+from ..store.results import accepted
 from .motion import dose_of, named, pixel_size_pm, standard_deviation
 
 UNIT = "vacuum A^2"
@@ -35,7 +36,7 @@ def with_scale(tracks: xr.Dataset, scale: str) -> xr.Dataset:
         Results; what is not accepted becomes NaN.
     scale
         ``paper``: Equation 3 counts 0.9111 of the Gaussian, its share in a box of +-2 sigma. ``ellipse``: 0.8647, its
-        share in the ellipse of Equation 5; see :func:`tract_dask.measure.intensities`.
+        share in the ellipse of Equation 5; see :func:`tract_dask.kernels.gaussian.intensity.intensities`.
 
     Returns
     -------
@@ -47,12 +48,12 @@ def with_scale(tracks: xr.Dataset, scale: str) -> xr.Dataset:
     SettingsError
         Where there is no such convention.
     """
-    if scale not in measure.INTENSITY_SCALE:
-        raise SettingsError("there is no such scale", "with_scale", ", ".join(measure.INTENSITY_SCALE), scale)
+    if scale not in INTENSITY_SCALE:
+        raise SettingsError("there is no such scale", "with_scale", ", ".join(INTENSITY_SCALE), scale)
     tracks = accepted(tracks)
     fits = tracks["fit"]
     both = xr.apply_ufunc(
-        partial(measure.intensities, scale=scale),
+        partial(intensities, scale=scale),
         fits.chunk({"parameter": -1}) if fits.chunks else fits,
         input_core_dims=[["parameter"]],
         output_core_dims=[[], []],
@@ -61,7 +62,7 @@ def with_scale(tracks: xr.Dataset, scale: str) -> xr.Dataset:
     )
     area = 2 * np.pi * fits.isel(parameter=SIGMA_A, drop=True) * fits.isel(parameter=SIGMA_B, drop=True)
     share = tracks["intensity"] / (fits.isel(parameter=AMPLITUDE, drop=True) * area)
-    stderr = tracks["intensity_stderr"] * (measure.INTENSITY_SCALE[scale] / share)
+    stderr = tracks["intensity_stderr"] * (INTENSITY_SCALE[scale] / share)
     values = {
         name: value.drop_vars(["parameter", "unit"], errors="ignore").assign_attrs(schema.RESULTS[name].attributes)
         for name, value in zip(_INTENSITIES, (*both, stderr), strict=True)
@@ -123,7 +124,7 @@ def vacuum_level(
         The summed image (:func:`tract_dask.sum_image`), for the mean over all frames; or a movie, for each frame.
     box
         (y0, y1, x0, x1) in the summed image, px. None, for a summed image: the largest flat square, as the fit finds it
-        (:func:`tract_dask.vacuum.find_vacuum`), for which ``columns`` and ``blur_sigma_px`` are needed.
+        (:func:`tract_dask.stages.fit.vacuum.find_vacuum`), for which ``columns`` and ``blur_sigma_px`` are needed.
     drift
         From :func:`tract_dask.estimate_drift`, for a movie: the box moves with it, by whole pixels.
 

@@ -13,9 +13,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 
-from .. import schema
 from ..errors import SettingsError
 from ..kernels.changepoints import gains, plateaus
+from ..store import schema
 from .motion import named, positions, standard_errors
 
 Floats = NDArray[np.float64]

@@ -12,18 +12,19 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from ..columns import find_columns
 from ..errors import SettingsError
-from ..kernels.filters import cut_windows
-from ..kernels.fitting import fit_gaussians
-from ..kernels.gaussian import blurred
-from ..kernels.information import column_bounds
-from ..measure import intensities
-from ..schema import AMPLITUDE, BACKGROUND, REJECTED, SIGMA_A, SIGMA_B, X, Y
-from ..seeds import column_dataset, positions
-from ..settings import ColumnSettings, FitSettings
-from ..stores import write_aside
-from ..windows import default_window, neighbour_distance
+from ..kernels.blur import cut_windows
+from ..kernels.gaussian.fit import fit_gaussians
+from ..kernels.gaussian.information import column_bounds
+from ..kernels.gaussian.intensity import intensities
+from ..kernels.gaussian.model import blurred
+from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from ..settings.run import ColumnSettings, FitSettings
+from ..stages.columns.find import find_columns
+from ..stages.columns.window_size import default_window, neighbour_distance
+from ..store.columns import column_dataset, positions
+from ..store.files import write_aside
+from ..store.schema import REJECTED
 from .intensity import UNIT
 
 Floats = NDArray[np.float64]

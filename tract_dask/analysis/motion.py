@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from .. import results, schema
 from ..errors import SettingsError
+from ..store import results, schema
 from .sites import fit_sites
 
 

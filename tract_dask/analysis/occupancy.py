@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from scipy.stats import norm
 
 from ..errors import SettingsError
-from ..kernels.gaussian import blurred
-from ..measure import intensities
-from ..results import accepted, fitted_with
-from ..schema import AMPLITUDE, Status
-from ..settings import FitSettings
+from ..kernels.gaussian.intensity import intensities
+from ..kernels.gaussian.model import blurred
+from ..kernels.gaussian.parameters import AMPLITUDE
+from ..settings.run import FitSettings
+from ..store.results import accepted, fitted_with
+from ..store.schema import Status
 from .intensity import UNIT, normalised
 from .likelihood import CONFIDENCE, Levels, credible_sets, probabilities
 from .lookup import intensity_bound, look_up_table, read_table, write_table

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from ..errors import InputError, SettingsError
-from ..kernels.gaussian import blurred
-from ..kernels.information import column_bounds
-from ..results import fitted_with
-from ..schema import SIGMA_A, SIGMA_B, X, Y
+from ..kernels.gaussian.information import column_bounds
+from ..kernels.gaussian.model import blurred
+from ..kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
+from ..store.results import fitted_with
 from .motion import dose_of, named, pixel_size_pm, positions, spread, standard_deviation, standard_errors
 
 _WIDEST_GAP = np.deg2rad(100)

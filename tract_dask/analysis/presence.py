@@ -17,9 +17,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
 
-from .. import schema
 from ..errors import SettingsError
 from ..kernels.presence import best_states
+from ..store import schema
 from .motion import named
 
 Floats = NDArray[np.float64]

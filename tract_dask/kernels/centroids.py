@@ -29,7 +29,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from .simd import INLINE, LANES, larger, load_at, select, smaller, total, vector
+from .vectors.simd import larger, load_at, select, smaller, total, vector
+from .vectors.tracing import INLINE, LANES
 
 Array = npt.NDArray[Any]
 

@@ -22,9 +22,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .filters import gaussian_kernel
-from .gaussian import blurred, evaluate
-from .simd import LANES, load, load_at, store, vector
+from .blur import gaussian_kernel
+from .gaussian.model import blurred, evaluate
+from .vectors.simd import load, load_at, store, vector
+from .vectors.tracing import LANES
 
 Array = NDArray[Any]
 

@@ -20,9 +20,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
-from .. import schema
 from ..errors import SettingsError
-from ..seeds import positions
+from ..store import schema
+from ..store.columns import positions
 
 Floats = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 from scipy import fft
 
-from .. import schema
-from ..schema import Status
-from ..seeds import positions
+from ..store import schema
+from ..store.columns import positions
+from ..store.schema import Status
 from .base import (
     COLOURS,
     FEW,

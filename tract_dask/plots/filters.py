@@ -32,9 +32,9 @@ def plot_filters(images: xr.DataArray, compared: xr.Dataset, path: str | Path | 
     Parameters
     ----------
     images
-        (filter, y, x) from :func:`tract_dask.comparison.filtered_region`.
+        (filter, y, x) from :func:`tract_dask.analysis.filters.filtered_region`.
     compared
-        From :func:`tract_dask.comparison.compare_filters`.
+        From :func:`tract_dask.analysis.filters.compare_filters`.
     path
         Where to save the figure, in the format that its suffix names; None: nowhere.
     """

@@ -15,10 +15,10 @@ from matplotlib.patches import Circle
 from scipy.ndimage import map_coordinates
 
 from ..errors import SettingsError
-from ..kernels.filters import blur, gaussian_kernel
-from ..kernels.gaussian import evaluate
-from ..movie import Movie
-from ..schema import AMPLITUDE, SIGMA_A, SIGMA_B, THETA, X, Y
+from ..kernels.blur import blur, gaussian_kernel
+from ..kernels.gaussian.model import evaluate
+from ..kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, THETA, X, Y
+from ..store.movie import Movie
 from .base import (
     FONT,
     LINES,

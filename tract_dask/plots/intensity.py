@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..analysis.intensity import repeated_error
-from ..results import accepted
+from ..store.results import accepted
 from .base import (
     COLUMN_INCHES,
     FONT,

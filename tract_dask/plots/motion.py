@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..analysis.motion import displacement, pixel_size_pm, spread, standard_errors
 from ..analysis.motion import positions as positions_pm
-from ..kernels.filters import blur, gaussian_kernel
-from ..movie import Movie
-from ..seeds import positions
+from ..kernels.blur import blur, gaussian_kernel
+from ..store.columns import positions
+from ..store.movie import Movie
 from .base import (
     COUNT_MAP,
     FIRST,

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ..analysis.intensity import UNIT
 from ..errors import SettingsError
-from ..seeds import positions
+from ..store.columns import positions
 from .base import (
     COLUMN_INCHES,
     COUNT_MAP,

@@ -15,9 +15,9 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 from ..analysis.motion import pixel_size_pm
 from ..analysis.precision import column_precision
 from ..errors import SettingsError
-from ..kernels.gaussian import blurred
-from ..schema import SIGMA_A, SIGMA_B, THETA
-from ..seeds import positions
+from ..kernels.gaussian.model import blurred
+from ..kernels.gaussian.parameters import SIGMA_A, SIGMA_B, THETA
+from ..store.columns import positions
 from .base import (
     COLUMN_INCHES,
     FONT,

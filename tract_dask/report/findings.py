@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schema import AXES
+from ..store.schema import AXES
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -241,7 +241,7 @@ def _drift(run: Survey) -> Iterator[Finding]:
 
 def _spacing(run: Survey) -> float | None:
     """Return the columns' distance from their neighbours, px."""
-    from ..windows import neighbour_distance
+    from ..stages.columns.window_size import neighbour_distance
 
     return neighbour_distance(np.stack([run.columns["x_ref"], run.columns["y_ref"]], axis=1))
 

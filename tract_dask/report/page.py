@@ -17,13 +17,16 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from .. import plots, stores
+from .. import plots
 from ..analysis.jumps import change_points
 from ..errors import TractError
-from ..provenance import digest_of
-from ..settings import RunSettings, Settings
-from ..small_files import read_small
-from ..web import STATIC, bundle
+from ..settings.declare import Settings
+from ..settings.run import RunSettings
+from ..store import files, metadata
+from ..store.files import read_small
+from ..store.provenance import digest_of
+from ..web import bundle
+from ..web.bundle import STATIC
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import figure_data, windows_data
@@ -78,7 +81,7 @@ def write_report(folder: str | Path, path: str | Path | None = None, *, figures:
     folder = Path(folder)
     place = folder / "report.html" if path is None else Path(path)
     run = survey(folder, _events(folder / "events.jsonl"))
-    stores.write_aside(place, render(run, _key(folder), figures=figures).encode(errors="backslashreplace"))
+    files.write_aside(place, render(run, _key(folder), figures=figures).encode(errors="backslashreplace"))
     return place
 
 
@@ -93,7 +96,7 @@ def is_current(folder: Path) -> bool:
 
 def _key(folder: Path) -> str:
     """Return the key of a report: all that the tracks say of themselves, and the settings of the run."""
-    about = json.dumps(stores.attributes(folder / "results.zarr"), sort_keys=True)
+    about = json.dumps(metadata.attributes(folder / "results.zarr"), sort_keys=True)
     settings = folder / "run.toml"
     return digest_of(about, settings.read_bytes() if settings.exists() else b"")
 

@@ -11,14 +11,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from .. import results, schema, stores
 from ..analysis import motion
 from ..analysis.jumps import noise_factor
 from ..errors import SettingsError
-from ..kernels.filters import blur
-from ..kernels.gaussian import evaluate
-from ..schema import Status
-from ..settings import RunSettings, load
+from ..kernels.blur import blur
+from ..kernels.gaussian.model import evaluate
+from ..kernels.gaussian.parameters import AMPLITUDE, X, Y
+from ..settings.run import RunSettings
+from ..settings.toml import load
+from ..store import datasets, metadata, results, schema
+from ..store.schema import Status
 
 VALUES = 1_600_000
 """Numbers that the series of all columns together may have: 4 MB of the page."""
@@ -99,19 +101,19 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     tracks = results.open_results(folder / "results.zarr")
     if tracks.nbytes <= _IN_MEMORY:
         tracks = tracks.load(scheduler="threads")
-    summed = stores.open_dataset(folder / "sum.zarr")
-    about = stores.attributes(folder / "results.zarr")
+    summed = datasets.open_dataset(folder / "sum.zarr")
+    about = metadata.attributes(folder / "results.zarr")
     scale = tracks.attrs.get("pixel_size_pm")
     measured = tracks if scale else tracks.assign_attrs(pixel_size_pm=1.0)  # lengths are then in px
     lazy = column_numbers(measured), frame_numbers(tracks), column_series(measured)
     columns, frames, series = dask.compute(*lazy, scheduler="threads", optimize_graph=False)  # else dask loses keys
     if (folder / "drift.zarr").exists():
-        frames["quality"] = ("frame", stores.open_dataset(folder / "drift.zarr")["quality"].to_numpy())
+        frames["quality"] = ("frame", datasets.open_dataset(folder / "drift.zarr")["quality"].to_numpy())
     columns["residual"] = ("column_id", residuals(tracks, summed)[0])
     return Survey(
         folder=folder,
         tracks=measured,
-        about=about | {"movie": stores.attributes(folder / "movie.zarr")},
+        about=about | {"movie": metadata.attributes(folder / "movie.zarr")},
         settings=_settings(folder / "run.toml"),
         unit="pm" if scale else "px",
         scale=scale or 1.0,
@@ -225,7 +227,7 @@ def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[NDArray[np.float6
     window, sigma = int(tracks.attrs["window_px"]), float(tracks.attrs["reference_blur_px"])
     image = blur(summed["image"].to_numpy(), sigma)
     parameters = tracks["fit_ref"].to_numpy().astype(np.float64)
-    parameters[:, [schema.Y, schema.X]] += summed.attrs.get("rounding_px", (0.0, 0.0))
+    parameters[:, [Y, X]] += summed.attrs.get("rounding_px", (0.0, 0.0))
     half = window // 2
     rows, columns = np.mgrid[-half : half + 1, -half : half + 1]
     disc = rows**2 + columns**2 <= half**2
@@ -233,13 +235,13 @@ def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[NDArray[np.float6
     for k, own in enumerate(parameters):
         if not np.isfinite(own).all():
             continue
-        y, x = (round(own[schema.Y]), round(own[schema.X]))
+        y, x = (round(own[Y]), round(own[X]))
         if min(y, x) < half or y + half >= image.shape[0] or x + half >= image.shape[1]:
             continue
         data = image[y - half : y + half + 1, x - half : x + half + 1]
         model = evaluate(own, columns + x, rows + y)
         shown[k] = np.where(disc, np.stack([data, model, data - model]), np.nan)
-    rms = np.sqrt(np.mean(shown[:, 2][:, disc] ** 2, axis=1)) / np.abs(parameters[:, schema.AMPLITUDE])
+    rms = np.sqrt(np.mean(shown[:, 2][:, disc] ** 2, axis=1)) / np.abs(parameters[:, AMPLITUDE])
     return rms, shown
 
 

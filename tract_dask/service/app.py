@@ -11,22 +11,22 @@ from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer
 from starlette.middleware.errors import ServerErrorMiddleware
 
-from ..cluster import local_memory_limit
-from . import problems
+from ..cluster.connect import local_memory_limit
+from . import error_handlers
 from .api import columns, events, files, health, jobs, plan, previews, results
+from .auth.gate import Gate
+from .auth.headers import BodyLimit, SecurityHeaders
+from .auth.tokens import Access
 from .config import ServiceConfig
-from .dashboard import Upstream, dashboard
-from .data.exports import Exports
-from .data.workshop import Workshop
-from .entrance.access import Access
-from .entrance.gate import Gate
-from .entrance.headers import BodyLimit, SecurityHeaders
-from .entrance.login import login
-from .feed import Feed
+from .events import Feed
 from .jobs.store import JobStore
 from .metrics import CountRequests, Metrics
 from .pages import pages, static_files
-from .running.runner import Runner
+from .pages.dask_proxy import Upstream, dashboard
+from .pages.login import login
+from .process_pool import Workshop
+from .runner.runner import Runner
+from .views.exports import Exports
 
 PREFIX = "/api/v1"
 
@@ -77,7 +77,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
     app.state.metrics = Metrics(app.state.store, app.state.feed)
     app.state.access = Access(app.state.store, config)
     app.state.runner, app.state.upstream = Runner(config, app.state.store), Upstream(config.cluster.tls)
-    problems.install(app)
+    error_handlers.install(app)
     documented = [Depends(_BEARER)] if app.state.access.demanded else []
     for part in (jobs, events, files, plan, previews, columns, results, health):
         app.include_router(part.router, prefix=PREFIX, dependencies=documented)
@@ -87,7 +87,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
     app.mount("/static", static_files, name="static")
     app.add_middleware(BodyLimit, most=config.max_body_bytes)  # the last one added is the first to see a request
     app.add_middleware(Gate, access=app.state.access, config=config)
-    app.add_middleware(ServerErrorMiddleware, handler=problems.unexpected)  # what it answers has the headers, too
+    app.add_middleware(ServerErrorMiddleware, handler=error_handlers.unexpected)  # what it answers has the headers, too
     app.add_middleware(SecurityHeaders)
     app.add_middleware(CountRequests, metrics=app.state.metrics)
     return app

@@ -9,8 +9,8 @@ import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..settings import ClusterSettings
-from .folders import STATE_FOLDER, DataRoot
+from ..settings.cluster import ClusterSettings
+from .data_root import STATE_FOLDER, DataRoot
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -32,7 +32,7 @@ class ServiceConfig:
     cluster
         Where jobs run.
     certificates
-        Folder of :func:`tract_dask.certificates.make_certificates`; None: plain HTTP.
+        Folder of :func:`tract_dask.cluster.certificates.make_certificates`; None: plain HTTP.
     tokens
         Demand tokens on loopback too, where other users of the machine could connect.
     allowed_hosts

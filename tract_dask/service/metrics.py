@@ -20,10 +20,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..progress import REPORT, STAGES
-from .feed import Feed
-from .jobs.clock import utc_now
+from .events import Feed
+from .jobs.records import Job, utc_now
 from .jobs.states import ENDED, State
-from .jobs.store import Job, JobStore
+from .jobs.store import JobStore
 
 _BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 _ENDLESS = "/events"

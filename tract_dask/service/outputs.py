@@ -17,18 +17,18 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-from .. import stores
 from ..errors import DestinationError
-from ..io.listing import WILD
-from ..locks import sole_use
-from ..pipeline import Outputs
-from ..small_files import read_small
-from .folders import DataRoot, OutsideError, folded
-from .refusals import ForbiddenError
+from ..readers.listing import WILD
+from ..store import files
+from ..store.files import read_small
+from ..store.locks import sole_use
+from ..store.run_folder import RunFolder
+from .data_root import DataRoot, OutsideError, folded
+from .errors import ForbiddenError
 
 MARK = ".tract_dask.json"
 LOCK = ".lock"
-"""As :func:`tract_dask.pipeline.sole_run` names it."""
+"""As :func:`tract_dask.store.run_folder.sole_run` names it."""
 
 JOBS = "jobs"
 """The folder of the outputs that jobs do not name themselves."""
@@ -169,7 +169,7 @@ def seal(root: DataRoot, mark: Mark) -> None:
     place = root.path / mark.output
     found = read_mark(place)
     if found is not None and found.job == mark.job:
-        made = {path.name: signature(path) for path in Outputs(place).written() if path.exists()}
+        made = {path.name: signature(path) for path in RunFolder(place).written() if path.exists()}
         with suppress(OSError):  # on a full disk nothing is noted, and what has a run's name counts as the job's
             write_mark(place, replace(found, made=made))
 
@@ -199,12 +199,12 @@ def _make(place: Path, mark: Mark) -> None:
 
 def write_mark(folder: Path, mark: Mark) -> None:
     """Write the mark of a folder, whole or not at all."""
-    stores.write_aside(folder / MARK, json.dumps(asdict(mark)).encode())
+    files.write_aside(folder / MARK, json.dumps(asdict(mark)).encode())
 
 
 def _holds_run(folder: Path) -> bool:
     """Tell whether a folder is the output of a run, of a job or by hand, or a store."""
-    outputs = Outputs(folder)
+    outputs = RunFolder(folder)
     signs = (folder / MARK, outputs.settings, outputs.events, folder / "zarr.json")
     return folder.suffix.lower() == ".zarr" or any(sign.exists() for sign in signs)
 

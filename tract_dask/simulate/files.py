@@ -16,9 +16,11 @@ import xarray as xr
 
 from ..analysis import lookup
 from ..errors import DestinationError, SettingsError
-from ..seeds import positions, read_columns_csv
-from ..settings import FitSettings, to_dict
-from ..stores import disk_errors, write_aside, write_dataset
+from ..settings.run import FitSettings
+from ..settings.toml import to_dict
+from ..store.columns import positions, read_columns_csv
+from ..store.datasets import write_dataset
+from ..store.files import disk_errors, write_aside
 from .movie import simulate_movie
 from .multislice import multislice_image, thickness_series
 from .pictured import simulate_multislice_movie

@@ -17,7 +17,7 @@ import xarray as xr
 
 from ..errors import DestinationError, SettingsError
 from ..kernels.rendering import PoissonTable, draw_counts, poisson_table
-from ..schema import AXES, texts
+from ..store.schema import AXES, texts
 from .scene import moving_scene
 
 Image: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]

@@ -18,7 +18,7 @@ from scipy import fft
 from scipy.spatial import cKDTree
 
 from ..errors import SettingsError
-from ..settings import to_toml
+from ..settings.toml import to_toml
 from .settings import PRESETS, Microscope
 from .structures import SAME_COLUMN_PM, Specimen, projected_columns, require_simulators
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ..settings import to_toml
+from ..settings.toml import to_toml
 from .movie import Image, check_movie, movie_truth, random_drift, vacuum_counts, write_movie
 from .multislice import BORDER_PM, Picture, pictures
 from .scene import Scene, moving_scene

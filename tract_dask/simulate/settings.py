@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..settings import Settings, setting
+from ..settings.declare import Settings, setting
 
 
 @dataclass(frozen=True)

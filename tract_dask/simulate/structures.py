@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..errors import InputError, SettingsError, SourceError
-from ..schema import texts
+from ..store.schema import texts
 from .ceria import LATTICE_PM, ROW_PITCH_PM, ROW_SHIFT_PM, ROW_SPACING_PM, Surface, ceria_surface
 from .settings import SpecimenSettings
 

@@ -9,9 +9,9 @@ import xarray as xr
 
 from ..analysis.lookup import look_up_table
 from ..errors import SettingsError
-from ..seeds import positions
-from ..settings import FitSettings
-from ..windows import neighbour_distance
+from ..settings.run import FitSettings
+from ..stages.columns.window_size import neighbour_distance
+from ..store.columns import positions
 
 _REACH = 2.0
 """In spacings: how far a column's neighbours may be away."""

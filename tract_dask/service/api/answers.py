@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from ...io import FileList
-from ...journal import logs
+from ...readers.listing import FileList
+from ...store.journal import logs
 
 Version = Annotated[
     str,

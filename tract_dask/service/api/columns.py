@@ -16,20 +16,23 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
-from ...seeds import MOST_SITES
-from ...settings import RunSettings, from_dict
-from ..data import curation
-from ..data.curation import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, Scene
-from ..data.workshop import Workshop
-from ..entrance.access import Identity, Role
+from ...settings.run import RunSettings
+from ...settings.toml import from_dict
+from ...stages.columns.sites import MOST_SITES
+from ..auth.tokens import Identity, Role
+from ..checks import inside
+from ..errors import invalid
+from ..jobs.public import JobRecord, Plain, Text
+from ..jobs.records import Job
 from ..jobs.states import CURATABLE, State
-from ..jobs.store import Job, JobStore
-from ..planning import inside
-from ..refusals import invalid
+from ..jobs.store import JobStore
+from ..process_pool import Workshop
+from ..views import column_editing
+from ..views.column_editing import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, Scene
 from .answers import whole
-from .asking import OwnJob, Who
-from .models import JobId, JobRecord, Plain, Text, errors
+from .models import JobId, errors
 from .previews import folder_of
+from .requests import OwnJob, Who
 
 router = APIRouter(tags=["columns"])
 
@@ -252,7 +255,7 @@ class Given:
 
     @property
     def parts(self) -> tuple[NDArray[np.float64], list[str], list[int | None]]:
-        """What :mod:`tract_dask.service.data.curation` takes."""
+        """What :mod:`tract_dask.service.views.column_editing` takes."""
         return self.places, self.kinds, self.column_ids
 
 
@@ -293,19 +296,19 @@ def saved_table(scene: Scene, highest_id: int, data: bytes) -> tuple[str, int, d
     New columns get numbers above ``highest_id``, of the versions that are kept, and those found automatically.
     """
     given = read_columns(NewVersion, data)
-    next_id = max(highest_id, curation.summary(scene)["highest_id"]) + 1
-    return curation.checked_csv(scene, *given.parts, next_id), len(given.places), given.said
+    next_id = max(highest_id, column_editing.summary(scene)["highest_id"]) + 1
+    return column_editing.checked_csv(scene, *given.parts, next_id), len(given.places), given.said
 
 
 def refined_table(scene: Scene, data: bytes) -> bytes:
     """Return the columns of a request refined, as JSON; for the workshop."""
     given = read_columns(ToRefine, data)
-    return curation.refined_json(scene, *given.parts, given.said["spacing_px"])
+    return column_editing.refined_json(scene, *given.parts, given.said["spacing_px"])
 
 
 def sites_of_lattice(scene: Scene, data: bytes) -> bytes:
     """Return the sites of the lattice of a request, as JSON; for the workshop."""
-    return curation.lattice_json(scene, *read_lattice(data))
+    return column_editing.lattice_json(scene, *read_lattice(data))
 
 
 def _sent(model: type[BaseModel]) -> dict[str, Any]:
@@ -337,7 +340,7 @@ def scene_of_job(job_id: JobId, request: Request) -> Scene:
     job: Job = request.app.state.store.job(job_id)
     settings = inside(request.app.state.root, from_dict(RunSettings, job.settings))
     folder = folder_of(request, job_id, "sum.zarr", "columns.zarr", "columns.csv")
-    return curation.scene_of(folder, settings)
+    return column_editing.scene_of(folder, settings)
 
 
 OfJob = Annotated[Scene, Depends(scene_of_job)]
@@ -346,7 +349,7 @@ OfJob = Annotated[Scene, Depends(scene_of_job)]
 @router.get("/jobs/{job_id}/columns", response_model=Versions, responses=errors(400, 404, 503))
 async def list_versions(job_id: JobId, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
     """List the versions of a job's columns."""
-    first = await request.app.state.workshop.run(curation.summary, scene, about=scene.sum)
+    first = await request.app.state.workshop.run(column_editing.summary, scene, about=scene.sum)
     return await run_in_threadpool(_versions, request.app.state.store, job_id, first, who)
 
 
@@ -355,7 +358,9 @@ async def read_version(job_id: JobId, version: VersionNumber, request: Request, 
     """Read a version of a job's columns."""
     store: JobStore = request.app.state.store
     table = await run_in_threadpool(store.columns, job_id, version) if version else None
-    return _json(await request.app.state.workshop.run(curation.version_json, scene, version, table, about=scene.sum))
+    return _json(
+        await request.app.state.workshop.run(column_editing.version_json, scene, version, table, about=scene.sum)
+    )
 
 
 @router.post(

@@ -10,8 +10,9 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 
-from ..feed import Feed, chunk, public_record
-from ..jobs.store import Job, JobStore
+from ..events import Feed, chunk, public_record
+from ..jobs.records import Job
+from ..jobs.store import JobStore
 from .models import JobId, errors
 
 router = APIRouter(tags=["events"])

@@ -8,8 +8,8 @@ from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from ..folders import PAGE, Page
-from ..planning import about_movie
+from ..checks import about_movie
+from ..data_root import PAGE, Page
 from .models import RelativePath, Shape, errors
 
 router = APIRouter(tags=["files"])

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..entrance.access import identity
+from ..auth.tokens import identity
 from ..jobs.states import State
 from ..jobs.store import JobStore
 from .models import errors

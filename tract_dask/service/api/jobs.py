@@ -9,13 +9,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from ..jobs.records import Deletion
+from ..checks import check_job
+from ..deletion import delete_files
+from ..jobs.public import JobRecord, Label
+from ..jobs.records import Deletion, Job
 from ..jobs.states import State
-from ..jobs.store import Job, JobStore
-from ..planning import check_job
-from ..tidying import delete_files
-from .asking import OwnJob, Who
-from .models import After, Deleted, JobDetail, JobId, JobList, JobRecord, Label, Log, LogLine, NewJob, NewLabel, errors
+from ..jobs.store import JobStore
+from .models import After, Deleted, JobDetail, JobId, JobList, Log, LogLine, NewJob, NewLabel, errors
+from .requests import OwnJob, Who
 
 router = APIRouter(tags=["jobs"])
 

@@ -7,10 +7,10 @@ from typing import Any, Literal
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..planning import plan_job
-from .asking import Who
-from .declarations import setting_rows
+from ..checks import plan_job
 from .models import RelativePath, SettingValues, Shape, errors
+from .requests import Who
+from .settings_schema import setting_rows
 
 router = APIRouter(tags=["plan"])
 

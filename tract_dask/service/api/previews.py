@@ -9,12 +9,13 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from ... import stores
 from ...errors import MissingStoreError
-from ...io import FileList
-from ...settings import MetadataSettings, SourceSettings, from_dict
-from ..data import pictures
-from ..data.pictures import MAX_SIDE_PX, View
+from ...readers.listing import FileList
+from ...settings.run import MetadataSettings, SourceSettings
+from ...settings.toml import from_dict
+from ...store.metadata import attributes
+from ..views import pictures
+from ..views.pictures import MAX_SIDE_PX, View
 from .answers import NOT_MODIFIED, Version, kept_answer, stamp
 from .models import JobId, RelativePath, errors
 
@@ -220,7 +221,7 @@ def _job_movie(request: Request, job_id: str) -> tuple[tuple[str | FileList, Sou
     """Return where the movie of a job is, converted if it is already, and its version."""
     state = request.app.state
     job, converted = state.store.job(job_id), folder_of(request, job_id, "movie.zarr") / "movie.zarr"
-    place = str(converted) if stores.attributes(converted).get("complete") else state.root.source(job.source)
+    place = str(converted) if attributes(converted).get("complete") else state.root.source(job.source)
     source = from_dict(SourceSettings, job.settings.get("source", {}))
     metadata = from_dict(MetadataSettings, job.settings.get("metadata", {}))
     return (place, source, metadata), _version(place)

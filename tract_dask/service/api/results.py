@@ -12,8 +12,8 @@ from fastapi.responses import FileResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
-from ...journal import journal_beside
-from ..data import exports, tracks
+from ...store.journal import journal_beside
+from ..views import exports, tracks
 from .answers import NOT_MODIFIED, kept_answer, stamp
 from .models import JobId, errors
 from .previews import folder_of

@@ -1,13 +1,26 @@
-"""A job and its events as the store hands them out."""
+"""Times as the store writes them: UTC, ISO 8601 with milliseconds, so that the texts sort as the times do."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from ...errors import InputError
 from .states import State
+
+
+def utc_now(later_s: float = 0.0) -> str:
+    """Return the time now, or ``later_s`` seconds later.
+
+    Examples
+    --------
+    >>> len(utc_now()) == len("2026-01-31T12:00:00.000Z"), utc_now() < utc_now(later_s=1.0)
+    (True, True)
+    """
+    time = datetime.now(UTC) + timedelta(seconds=later_s)
+    return time.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 class UnknownJobError(InputError):
@@ -43,7 +56,7 @@ class Job:
     attempts
         How often it has been started.
     progress, outcome
-        As :class:`tract_dask.service.running.timeline.Timeline` and :class:`tract_dask.pipeline.RunOutcome` tell them.
+        As :class:`tract_dask.service.runner.timeline.Timeline` and :class:`tract_dask.run.pipeline.RunOutcome` tell them.
     columns_version
         Of the columns that are fitted; 0: those found automatically; None: nobody has chosen.
     not_before

@@ -8,9 +8,8 @@ import sqlite3
 from collections.abc import Sequence
 from typing import Any
 
-from ..folders import overlap
-from .clock import utc_now
-from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError
+from ..data_root import overlap
+from .records import ConflictError, Job, JobEvent, UnknownJobError, UnknownVersionError, utc_now
 from .states import ENDED, TRANSITIONS, State
 
 AFRESH: dict[str, Any] = {"ended": None, "not_before": None, "lost_tries": 0, "outcome": {}}

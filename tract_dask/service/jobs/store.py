@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from . import rows
-from .clock import utc_now
-from .records import ConflictError, Deletion, Job, JobEvent, UnknownJobError, UnknownVersionError
+from .records import ConflictError, Deletion, Job, JobEvent, UnknownJobError, UnknownVersionError, utc_now
 from .states import CURATABLE, RETRYABLE, State
 from .tables import JobStoreError, check_place, migrate, store_error
 

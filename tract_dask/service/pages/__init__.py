@@ -10,8 +10,8 @@ from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from fastapi.templating import Jinja2Templates
 
-from ...web import STATIC
-from ..entrance.access import IDENTITY, identity
+from ...web.bundle import STATIC
+from ..auth.tokens import IDENTITY, identity
 
 _FOLDER = Path(__file__).parent
 
@@ -21,7 +21,7 @@ pages = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 
 def error_page(request: Request, problem: dict[str, str], status: int) -> HTMLResponse:
-    """Return the page for an error, given as in :func:`tract_dask.service.problems.body`."""
+    """Return the page for an error, given as in :func:`tract_dask.service.errors.body`."""
     about = {"problem": problem, "who": request.scope.get(IDENTITY)}
     return templates.TemplateResponse(request, "error.html", about, status)
 

@@ -1,0 +1,278 @@
+"""The command line: options, exit codes, and what is printed where."""
+
+import dataclasses
+import io
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from importlib.metadata import entry_points
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rich.console import Console
+
+from tract_dask.cli import main as cli
+from tract_dask.cli import options
+from tract_dask.cli.terminal import Terminal
+from tract_dask.errors import ClusterError
+from tract_dask.progress import RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
+from tract_dask.run import pipeline
+from tract_dask.run import plan as run_plan
+from tract_dask.settings import RunSettings, to_toml
+from tract_dask.store import run_folder
+
+GROUPS = tuple(options.TITLES)
+
+
+def tract(*arguments: object):
+    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def captured(monkeypatch):
+    """Settings and arguments that the command ``run`` hands to the library, which then does nothing."""
+    found = {}
+
+    def run(source, output, settings, **more):
+        found.update(source=source, output=output, settings=settings, **more)
+        plan = run_plan.plan_run((8, 64, 64), np.dtype("u1"), settings)
+        return pipeline.RunOutcome(run_folder.RunFolder(output), plan, "done", 8, 3, 24, 20)
+
+    monkeypatch.setattr(pipeline, "run", run)
+    return found
+
+
+@pytest.fixture
+def inline(monkeypatch):
+    """Run everything in this process."""
+    from distributed import Client, LocalCluster
+
+    from tract_dask.cluster import connect as cluster
+
+    with (
+        LocalCluster(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+
+        class Here(cluster.LazyClient):
+            def __init__(self, settings, given=None, on_connect=lambda client: None):
+                super().__init__(settings, client, on_connect)
+
+        monkeypatch.setattr(pipeline, "LazyClient", Here)
+        yield client
+
+
+def test_every_setting_has_an_option_with_its_sentence():
+    text = " ".join(tract("run", "--help").output.split())
+    for group in dataclasses.fields(RunSettings()):
+        for item in dataclasses.fields(getattr(RunSettings(), group.name)):
+            if item.metadata["in_files_only"]:
+                continue
+            flag = item.metadata["flag"] or "--" + item.name.replace("_", "-")
+            assert flag in text
+            assert item.metadata["description"] in text
+    assert all(title in text for title in options.TITLES.values())
+
+
+def test_options_override_the_configuration(captured, tmp_path):
+    config = tmp_path / "run.toml"
+    start = dataclasses.replace(
+        RunSettings(), fit=dataclasses.replace(RunSettings().fit, threshold=3.0, blur_sigma_px=1.0)
+    )
+    config.write_text(to_toml(start))
+    result = tract("run", "m.tif", "out", "--config", config, "--threshold", 2.5, "--vacuum-box", "0,8,0,9")
+    assert result.exit_code == 0, result.output
+    fit = captured["settings"].fit
+    assert (fit.threshold, fit.blur_sigma_px, fit.vacuum_box) == (2.5, 1.0, (0, 8, 0, 9))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "group", "expected"),
+    [
+        (("--columns", "a.csv"), "columns", {"method": "csv", "csv": "a.csv"}),
+        (("--drift-csv", "d.csv"), "drift", {"method": "csv", "csv": "d.csv"}),
+        (("--no-drift",), "drift", {"method": "none"}),
+        (("--no-drift-refine",), "drift", {"refine": False}),
+        (("--lattices", "[{origin = [1, 2]}]"), "columns", {"method": "lattice", "lattices": ({"origin": [1, 2]},)}),
+        (("--raw-shape", "0,64,32", "--raw-dtype", "u2"), "source", {"raw_shape": (0, 64, 32), "raw_dtype": "u2"}),
+        (("--workers", "3", "--memory-limit", "2GB"), "cluster", {"workers": 3, "memory_limit": "2GB"}),
+        (("--pixel-size-pm", "7.8"), "metadata", {"pixel_size_pm": 7.8}),
+        (("--contrast", "dark"), "columns", {"contrast": "dark", "method": "auto"}),
+    ],
+)
+def test_options_become_settings(captured, arguments, group, expected):
+    result = tract("run", "m.tif", "out", *arguments)
+    assert result.exit_code == 0, result.output
+    found = getattr(captured["settings"], group)
+    assert {name: getattr(found, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--threshold", "1000"), "out of range"),
+        (("--threshold", "high"), "not a valid float"),
+        (("--codec", "zip"), "zip"),
+        (("--vacuum-box", "1;2"), "commas"),
+        (("--lattices", "{"), "not TOML"),
+        (("--lattices", "3"), "not a list"),
+        (("--config", "nowhere.toml"), "cannot be read"),
+        (("--no-such-option",), "No such option"),
+    ],
+)
+def test_bad_usage_ends_with_2_and_one_paragraph(captured, arguments, message):
+    result = tract("run", "m.tif", "out", *arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not captured
+
+
+def test_missing_movie_ends_with_2(tmp_path):
+    result = tract("run", tmp_path / "none.tif", tmp_path / "out")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Error: ")
+    assert str(tmp_path / "none.tif") in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(ClusterError("no", "x"), 1), (KeyboardInterrupt(), 130), (ValueError("odd"), 1)]
+)
+def test_errors_become_exit_codes(monkeypatch, error, code):
+    def run(*_, **__):
+        raise error
+
+    monkeypatch.setattr(pipeline, "run", run)
+    result = tract("run", "m.tif", "out")
+    assert result.exit_code == code
+    assert "Traceback" not in result.stderr
+    if code == 1:
+        assert "Traceback" in tract("run", "m.tif", "out", "--debug").stderr
+
+
+def test_json_is_all_that_stands_on_stdout(captured):
+    result = tract("run", "m.tif", "out", "--json")
+    record = json.loads(result.stdout)
+    assert (record["state"], record["columns"], record["accepted"]) == ("done", 3, 20)
+    assert record["outputs"]["results"].endswith("results.zarr")
+
+
+def test_plan_is_printed(npy, scene, tmp_path):
+    movie = npy(scene.counts())
+    result = tract("run", movie, tmp_path / "out", "--plan", "--shard-mb", 1)
+    assert result.exit_code == 0, result.output
+    assert "6 of 2 frames" in result.stdout
+    assert not (tmp_path / "out").exists()
+    record = json.loads(tract("run", movie, tmp_path / "out", "--plan", "--json").stdout)
+    assert record["plan"]["frames"] == scene.n_frames
+
+
+def test_plan_over_budget_is_refused(npy, scene, tmp_path):
+    result = tract("run", npy(scene.counts()), tmp_path / "out", "--plan", "--memory-limit", "100MB")
+    assert result.exit_code == 1
+    assert "at most 0.10 GB a task" in result.stderr
+
+
+def test_run_and_inspect(npy, scene, tmp_path, inline):
+    movie, out = npy(scene.counts()), tmp_path / "out"
+    result = tract("run", movie, out, "--shard-mb", 1)
+    assert result.exit_code == 0, result.output
+    assert ["columns", str(len(scene.place))] in [line.split() for line in result.stdout.splitlines()]
+    assert "results.zarr" in result.stdout
+    assert "fit: done in" in result.stderr
+    assert json.loads(tract("inspect", movie, "--json").stdout)["frames"] == scene.n_frames
+    assert json.loads(tract("inspect", out, "--json").stdout)["results.zarr"] == "complete"
+    for name in ("movie.zarr", "drift.zarr", "results.zarr"):
+        assert json.loads(tract("inspect", out / name, "--json").stdout)["frames"] == scene.n_frames
+    assert json.loads(tract("inspect", out / "columns.zarr", "--json").stdout)["columns"] == len(scene.place)
+    assert "pixel size" in tract("inspect", out / "sum.zarr").stdout
+
+
+def test_frames_that_cannot_be_fitted_end_with_3(npy, scene, tmp_path, inline):
+    frames = scene.counts().astype(np.float32)
+    frames[3, 80, 70] = np.inf
+    result = tract("run", npy(frames), tmp_path / "out")
+    assert result.exit_code == 3, result.output
+    assert "could not be fitted" in result.stderr
+    assert "frames not fitted" in result.stdout
+
+
+def test_stage_by_stage(npy, scene, tmp_path, inline):
+    movie, drift, columns, results = (tmp_path / name for name in ("m.zarr", "d.zarr", "c.csv", "r.zarr"))
+    for arguments in (
+        ("convert", npy(scene.counts()), movie, "--shard-mb", 1),
+        ("drift", movie, drift),
+        ("columns", movie, columns, "--drift-from", drift),
+        ("fit", movie, columns, results, "--drift-from", drift, "--json"),
+    ):
+        result = tract(*arguments)
+        assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["fits"] == scene.n_frames * len(scene.place)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_shows_what_is_done_and_how_fast(terminal):
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=terminal, width=120, color_system=None)
+    with Terminal(console) as show:
+        show(RunStarted("movie.tif", "out"))
+        show(RunStarted("movie.tif", "out", "http://127.0.0.1:8787/status"))
+        show(StageDone("convert", 0.0, reused=True))
+        show(StageStarted("fit", 600, 100, 40, 1 << 20))
+        show.lines["fit"].began -= 10.0
+        show(ShardDone("fit", 0, 100, 4000))
+        show(Warned("look at this"))
+        console.print(show.table())
+        show(StageDone("fit", 20.0, summary="3900 of 4000 fits accepted"))
+        show(RunDone("done_with_bad_frames", 75.0))
+    text = file.getvalue()
+    assert text.count("movie.tif → out") == 1
+    assert "dashboard http://127.0.0.1:8787/status" in text
+    assert "200/600 frames" in text
+    assert re.search(r"(9\.\d+|10) frames/s +(39\d|400) fits/s", text)
+    assert re.search(r"4\d s left", text)
+    assert "warning: look at this" in text
+    assert "could not be fitted (1:15)" in text
+
+
+def test_dask_knows_the_command():
+    (entry,) = [entry for entry in entry_points(group="dask_cli") if entry.name == "tract"]
+    assert entry.load() is cli.main
+
+
+def test_help_needs_none_of_the_heavy_modules():
+    code = "import sys, tract_dask.cli.main; print([m for m in ('numpy', 'dask', 'zarr', 'numba') if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_ends_cleanly(npy, scene, tmp_path, number):
+    import psutil
+
+    scene.n_frames = 12
+    movie, out = npy(np.tile(scene.counts(), (80, 1, 1))), tmp_path / "out"
+    command = [sys.executable, "-m", "tract_dask.cli.main", "run", movie, out, "--workers", "1", "--shard-mb", "1"]
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs do not hear Ctrl-C
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True, preexec_fn=heard) as process:
+        events = out / "events.jsonl"
+        deadline = time.monotonic() + 120
+        while not (events.exists() and "ShardDone" in events.read_text()):
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "what is done is kept" in errors
+    assert "Traceback" not in errors
+    assert not psutil.wait_procs(workers, timeout=60)[1]
+    assert json.loads(events.read_text().splitlines()[-1])["state"] == "interrupted"

@@ -1,0 +1,36 @@
+"""Readers that crash, hang and starve, for the service's processes: imported there, they read made-up formats."""
+
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+from tract_dask.readers import READERS
+from tract_dask.service.process_pool import _private
+from tract_dask.store.columns import column_dataset
+
+
+def crash(path: Path, *_: object):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def hang(path: Path, *_: object):
+    time.sleep(60)
+
+
+def starve(path: Path, *_: object):
+    return np.ones(8 << 30, np.uint8)
+
+
+def reserved() -> int:
+    """Return the bytes of private memory that a table of one column takes, with the libraries that it needs."""
+    before = _private()
+    column_dataset([[1.0, 2.0]])
+    return _private() - before
+
+
+if multiprocessing.parent_process() is not None:  # not where the tests are collected
+    READERS |= {".crash": crash, ".hang": hang, ".starve": starve}

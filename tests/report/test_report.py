@@ -1,0 +1,611 @@
+"""The report: its numbers against the Dataset's, its warnings where they belong, and a page that needs nothing else."""
+
+import base64
+import dataclasses
+import json
+import re
+from contextlib import contextmanager
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import xarray as xr
+from conftest import Scene, store_fits
+from matplotlib import colormaps
+
+from tract_dask.errors import StoreError
+from tract_dask.report import page
+from tract_dask.report.findings import findings
+from tract_dask.report.interactive import quantised, script_json
+from tract_dask.report.page import is_current, write_report
+from tract_dask.report.survey import column_series, survey
+from tract_dask.service.api.results import _REPORT_POLICY
+from tract_dask.settings import FitSettings, RunSettings, to_toml
+from tract_dask.store import datasets, metadata, results, schema
+from tract_dask.store.schema import Status
+
+N_FRAMES, ERROR_PX, PIXEL_PM = 40, 0.5, 4.0
+WAIT_MS = 15_000
+KIND = "Ce</script><!--<b>&"
+VOID = {"meta", "link", "img", "br", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order, and keeps what a test asks for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open, self.references, self.findings, self.alternatives = [], [], {}, []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.references += [values[name] for name in ("src", "href", "srcset", "action") if name in values]
+        if "data-finding" in values:
+            self.findings[values["data-finding"]] = values["class"]
+        if tag == "img":
+            self.alternatives.append(values.get("alt", ""))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+class Run:
+    """A folder with tracks whose numbers are known: columns that keep still with errors as they are stated."""
+
+    def __init__(self, folder, **about):
+        self.scene = Scene(n_frames=N_FRAMES, seed=3)
+        columns, n = self.scene.columns(), len(self.scene.place)
+        rng = np.random.default_rng(5)
+        self.values = {}
+        for name, variable in schema.RESULTS.items():
+            sizes = {"frame": N_FRAMES, "column_id": n} | schema.SIZES
+            self.values[name] = np.zeros([sizes[dim] for dim in variable.dims], variable.dtype)
+        self.values["fit"][:] = columns["fit_ref"].to_numpy()
+        self.values["fit"][..., 1:3] += rng.normal(0, ERROR_PX, (N_FRAMES, n, 2))
+        self.values["stderr"][:] = ERROR_PX
+        self.values["intensity"][:] = 4000 + rng.normal(0, 50, (N_FRAMES, n))
+        self.values["intensity_stderr"][:] = 50
+        self.values["r_squared"][:] = 0.8
+        self.values["drift"][:] = self.values["drift_measured"][:] = self.scene.drift
+        self.values["time"][:] = 0.1 * np.arange(N_FRAMES)
+        self.folder, self.columns = folder, columns
+        self.about = {"pixel_size_pm": PIXEL_PM, "frame_time_s": 0.1, "dose": 500.0} | about
+        self.settings = RunSettings()
+
+    def write(self):
+        path = self.folder / "results.zarr"
+        results.create(
+            path,
+            self.columns,
+            self.values["drift_measured"],
+            self.values["time"],
+            N_FRAMES,
+            settings=to_toml(self.settings.fit),
+            window=19,
+            reference_blur_px=2.0,
+            created="2026-11-22T08:00:00+00:00",
+            source="/data/movie.tif",
+            versions={"tract_dask": "0.1.0"},
+            **self.about,
+        )
+        stored = {name: values for name, values in self.values.items() if name not in ("time", "drift_measured")}
+        store_fits(path, stored, N_FRAMES)
+        summed = self.scene.summed()
+        summed.attrs = {"pixel_size_pm": self.about["pixel_size_pm"]} if self.about["pixel_size_pm"] else {}
+        datasets.write_dataset(summed, self.folder / "sum.zarr")
+        (self.folder / "run.toml").write_text(to_toml(self.settings))
+        return self.folder
+
+    def names(self):
+        found = findings(survey(self.write(), []))
+        return {finding.name for finding in found}
+
+
+@pytest.fixture
+def run(tmp_path):
+    return Run(tmp_path)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Leave the figures out, which take most of the time."""
+    monkeypatch.setattr(page, "_pictures", lambda _: [])
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A run with a weak column and a changed setting, and its page."""
+    made = Run(tmp_path_factory.mktemp("run"))
+    made.values["status"][: N_FRAMES * 3 // 4, 2] = Status.BELOW_NOISE
+    made.values["r_squared"][:, 2] = 0.6
+    made.columns["kind"][1] = KIND
+    made.settings = RunSettings(fit=FitSettings(threshold=2.5))
+    return made, write_report(made.write()).read_text(encoding="utf-8")
+
+
+def test_page_is_well_formed_and_needs_nothing_else(written):
+    found = Page(written[1])
+    assert not found.open
+    assert found.references
+    assert all(reference.startswith(("data:", "#")) for reference in found.references)
+    outside = re.sub(r"<script.*?</script>", "", written[1], flags=re.DOTALL)
+    assert "http:" not in outside
+    assert "https:" not in outside
+    assert "@import" not in outside
+    assert not re.search(r"<script[^>]*\bsrc=", written[1])
+    assert found.alternatives
+    assert all(found.alternatives)
+    assert len(written[1]) < 4e6
+
+
+def test_page_has_the_true_numbers(written):
+    made, text = written
+    tracks = results.accepted(results.open_results(made.folder / "results.zarr")).load()
+    place = tracks["fit"].sel(parameter=["x", "y"]).to_numpy() * PIXEL_PM
+    sd = np.sqrt((np.nanstd(place, axis=0, ddof=1) ** 2).mean(axis=1))
+    n = len(made.scene.place)
+    accepted = N_FRAMES * n - N_FRAMES * 3 // 4
+    assert f"{accepted:,} of {N_FRAMES * n:,} fits were accepted ({accepted / (N_FRAMES * n):.1%})" in text
+    assert f"A column spreads by {np.median(sd):.3g} pm per axis" in text
+    assert f"the fits state an error of {ERROR_PX * PIXEL_PM:.3g} pm" in text
+    span = PIXEL_PM * np.ptp(made.scene.drift, axis=0)
+    assert f"{span[1]:.3g} × {span[0]:.3g} pm" in text
+    assert "movie.tif" in text
+    assert "500 e/Å²" in text
+    assert "4 pm" in text
+
+
+def test_changed_settings_come_first(written):
+    _, text = written
+    changed = text[text.index("Changed from their defaults (1)") : text.index("All of [source]")]
+    assert "<code>fit.threshold</code>" in changed
+    assert "<td>2.5" in changed
+    assert changed.count("<code>") == 1
+
+
+def test_numbers_of_columns_are_those_of_the_dataset(written):
+    made, _ = written
+    found = survey(made.folder, []).columns
+    np.testing.assert_allclose(found["share"][2], 0.25)
+    np.testing.assert_array_equal(np.delete(found["share"].to_numpy(), 2), 1.0)
+    np.testing.assert_allclose(found["expected"], ERROR_PX * PIXEL_PM)
+    np.testing.assert_allclose(found["r_squared"][2], 0.6, rtol=1e-6)
+    np.testing.assert_allclose(np.delete(found["r_squared"].to_numpy(), 2), 0.8, rtol=1e-6)
+    assert int(found["below_noise"][2]) == N_FRAMES * 3 // 4
+    assert float(found["residual"].max()) < 0.02  # the scene is Gaussians; what their neighbours add, and the blur
+
+
+def test_good_run_has_no_warnings(run):
+    assert run.names() == set()
+
+
+def _weak_column(run):
+    run.values["status"][: N_FRAMES * 3 // 4, 2] = Status.BELOW_NOISE
+
+
+def _few_accepted(run):
+    run.values["status"][::4] = Status.NOT_CONVERGED
+
+
+def _at_bound(run):
+    run.values["status"][::20] = Status.AT_BOUND
+
+
+def _bad_frame(run):
+    run.values["status"][7] = Status.BAD_FRAME
+
+
+def _outside(run):
+    run.values["status"][:, 0] = Status.OUTSIDE_FRAME
+
+
+def _sometimes_outside(run):
+    run.values["status"][:5, 0] = Status.OUTSIDE_FRAME
+
+
+def _errors_too_small(run):
+    run.values["stderr"] /= 2
+
+
+def _no_errors(run):
+    run.values["stderr"][:] = np.nan
+
+
+def _long_drift(run):
+    run.values["drift"][:, 1] = np.linspace(0, 40, N_FRAMES)
+
+
+def _drift_step(run):
+    run.values["drift_measured"][20:, 0] += 20
+
+
+def _odd_column(run):
+    run.columns["fit_ref"][1, 0] *= 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (_weak_column, {"weak_columns"}),
+        (_few_accepted, {"accepted", "not_converged", "poor_frames"}),
+        (_at_bound, {"at_bound", "poor_frames"}),
+        (_bad_frame, {"bad_frames"}),
+        (_outside, {"never_fitted"}),
+        (_sometimes_outside, {"at_the_edge"}),
+        (_errors_too_small, {"scatter"}),
+        (_no_errors, {"no_errors"}),
+        (_long_drift, {"long_drift"}),
+        (_drift_step, {"long_step"}),
+        (_odd_column, {"residual"}),
+    ],
+)
+def test_warnings_are_where_they_belong(run, change, expected):
+    change(run)
+    assert run.names() == expected
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path):
+    made = Run(tmp_path, pixel_size_pm=None, frame_time_s=None)
+    assert made.names() == {"pixel_size", "frame_time"}
+    text = write_report(tmp_path).read_text(encoding="utf-8")
+    assert f"the fits state an error of {ERROR_PX:.3g} px" in text
+    assert Page(text).findings == {"pixel_size": "warning", "frame_time": "note"}
+
+
+def test_warnings_of_the_run_itself_are_repeated(run):
+    events = [
+        {"event": "Warned", "message": "of an earlier run"},
+        {"event": "RunStarted"},
+        {"event": "Warned", "message": "columns.csv was edited by hand"},
+    ]
+    assert [finding.text for finding in findings(survey(run.write(), events))] == ["Columns.csv was edited by hand."]
+
+
+def test_series_keep_the_extremes(run):
+    run.values["fit"][17, 3, 1] += 30  # px: a single wild fit
+    run.values["status"][10:20, 5] = Status.BELOW_NOISE
+    tracks = results.open_results(run.write() / "results.zarr").load()
+    n = tracks.sizes["column_id"]
+    series = column_series(tracks, values=12 * n * 4)
+    assert series.attrs["frames"] == 10
+    assert series.sizes["bin"] == 4
+    own = series.sel(quantity="x").isel(column_id=3)
+    x = (run.values["fit"][:, 3, 1] - run.columns["x_ref"].to_numpy()[3]) * PIXEL_PM
+    np.testing.assert_allclose(own["mean"], x.reshape(4, 10).mean(axis=1))
+    np.testing.assert_allclose(own["high"], x.reshape(4, 10).max(axis=1))
+    np.testing.assert_allclose(own["low"], x.reshape(4, 10).min(axis=1))
+    np.testing.assert_allclose(own["error"], ERROR_PX * PIXEL_PM / np.sqrt(10))
+    assert np.isnan(series["mean"].isel(bin=1, column_id=5)).all()
+    lazy = column_series(tracks.chunk(frame=7), values=12 * n * 4).compute()
+    xr.testing.assert_allclose(lazy, series)
+
+
+def test_packed_numbers_are_the_numbers():
+    rng = np.random.default_rng(1)
+    values = rng.normal(3, 100, (5, 40))
+    values[1, 7], values[2] = np.nan, np.nan
+    values[3] = 2.5
+    numbers, zero, step = quantised(values)
+    numbers = numbers.reshape(values.shape)
+    back = np.where(numbers == -32768, np.nan, zero[:, None] + step[:, None] * numbers)
+    np.testing.assert_array_equal(np.isnan(back), np.isnan(values))
+    span = np.nanmax(values[[0, 1, 4]], axis=1) - np.nanmin(values[[0, 1, 4]], axis=1)
+    assert (np.nanmax(np.abs(back - values)[[0, 1, 4]], axis=1) <= 0.51 * span / 65534).all()
+    np.testing.assert_allclose(back[3], 2.5)
+
+
+def page_data(text: str) -> dict:
+    """What the page's scripts are given."""
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def unpacked(packed: dict[str, str]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["base64"]), np.dtype(packed["dtype"]).newbyteorder("<"))
+
+
+def trusted(made: Run) -> xr.Dataset:
+    return results.accepted(results.open_results(made.folder / "results.zarr")).load()
+
+
+def in_time(made: Run, quantity: str) -> np.ndarray:
+    """What the report shows of every column (column, frame): places from that in the summed image, pm; counts."""
+    tracks = trusted(made)
+    if quantity == "intensity":
+        return tracks["intensity"].to_numpy().T
+    place = tracks["fit"].sel(parameter=quantity) - made.columns[f"{quantity}_ref"].to_numpy()
+    return PIXEL_PM * place.to_numpy().T
+
+
+@pytest.mark.parametrize("quantity", ["x", "y", "intensity"])
+def test_series_on_the_page_are_those_of_the_dataset(written, quantity):
+    made, text = written
+    own = page_data(text)["series"][quantity]["mean"]
+    numbers, zero, step = (unpacked(own[name]) for name in ("numbers", "zero", "step"))
+    expected = in_time(made, quantity)
+    shown = np.where(numbers == -32768, np.nan, zero.repeat(N_FRAMES) + step.repeat(N_FRAMES) * numbers)
+    np.testing.assert_array_equal(np.isnan(shown), np.isnan(expected.ravel()))
+    assert np.nanmax(np.abs(shown - expected.ravel()) / step.repeat(N_FRAMES)) <= 0.51
+    np.testing.assert_allclose(unpacked(page_data(text)["series"]["time"]), 0.1 * np.arange(N_FRAMES), atol=1e-9)
+
+
+def test_no_text_of_a_run_ends_a_script(written):
+    made, text = written
+    assert page_data(text)["kinds"] == [str(kind) for kind in made.columns["kind"].to_numpy()]
+    assert KIND not in text
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        script_json({"spread": float("nan")})
+
+
+def test_page_is_small_and_has_no_library(written):
+    made, _ = written
+    text = write_report(made.folder, made.folder / "small.html", figures=False).read_text(encoding="utf-8")
+    assert "bokeh" not in text.lower()
+    assert len(text) < 250_000
+
+
+@contextmanager
+def opened(chromium, address, theme="light", policy=""):
+    """The page, which has to end without a complaint of the browser, and to ask for nothing beside itself."""
+    context = chromium.new_context(color_scheme=theme, viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(WAIT_MS)
+    shown, said, asked = context.new_page(), [], []
+    shown.on("console", lambda message: said.append(message.text))
+    shown.on("pageerror", lambda error: said.append(str(error)))
+    shown.on("request", lambda request: request.url.startswith(("data:", "blob:")) or asked.append(request.url))
+    if policy:
+        file, address = address, "http://report.test/"
+        headers = {"Content-Security-Policy": policy, "Content-Type": "text/html; charset=utf-8"}
+        context.route(address, lambda route: route.fulfill(path=file, headers=headers))
+    try:
+        shown.goto(address)
+        shown.wait_for_selector("#map canvas.overlay")
+        yield shown
+        assert said == []
+        assert asked == [address]
+    finally:
+        context.close()
+
+
+@pytest.fixture
+def shown(chromium, written):
+    with opened(chromium, f"file://{written[0].folder / 'report.html'}") as page:
+        yield page
+
+
+def on_map(page, made: Run, index: int) -> tuple[float, float]:
+    """The place of a column in the map, CSS px: the image fits into it, with four px around."""
+    (ny, nx), box = made.scene.shape, page.locator("#map").bounding_box()
+    scale = min((box["width"] - 8) / nx, (box["height"] - 8) / ny)
+    away = made.scene.place[index] - (np.array([nx, ny]) - 1) / 2
+    return tuple(np.array([box["width"], box["height"]]) / 2 + scale * away)
+
+
+def click_column(page, made: Run, index: int) -> None:
+    x, y = on_map(page, made, index)
+    page.click("#map", position={"x": x, "y": y})
+
+
+def settle(page) -> None:
+    """Wait until everything is drawn."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def walk(page, chart: str, steps: int) -> list[list[str]]:
+    """What the chart tells of its points one after the other, as somebody hears who has but a keyboard."""
+    page.focus(f"#{chart} canvas")
+    page.keyboard.press("Home")
+    told = []
+    for _ in range(steps):
+        settle(page)
+        told.append(page.locator(f"#{chart} .chart-legend b").all_text_contents())
+        page.keyboard.press("ArrowRight")
+    return told
+
+
+def number(text: str) -> float:
+    found = re.match(r"-?[\d,.]+(e-?\d+)?", text)
+    return float(found[0].replace(",", "")) if found else np.nan
+
+
+def chosen(page) -> str:
+    return page.locator("#chosen").text_content()
+
+
+@pytest.mark.parametrize("quantity", ["x", "y", "intensity"])
+def test_a_click_on_a_column_shows_the_values_of_the_dataset(shown, written, quantity):
+    made, _ = written
+    click_column(shown, made, 2)
+    assert chosen(shown) == "3 (Ce)"
+    assert shown.locator("#column").input_value() == "2"
+    told = np.array([number(one) for (one,) in walk(shown, quantity, N_FRAMES)])
+    expected = in_time(made, quantity)[2]
+    assert np.isnan(told).sum() == N_FRAMES * 3 // 4  # gaps, where no fit is accepted
+    np.testing.assert_allclose(told, expected, rtol=6e-4, atol=np.nanmax(np.abs(expected)) / 30_000)
+
+
+def test_the_whole_series_is_in_the_charts_description(shown, written):
+    made, _ = written
+    click_column(shown, made, 4)
+    settle(shown)
+    label = shown.locator("#x canvas").get_attribute("aria-label")
+    x = in_time(made, "x")[4]
+    low, high = re.fullmatch(r"x of column 5 in time: x \(pm\) from (\S+) to (\S+)", label).groups()
+    np.testing.assert_allclose([float(low), float(high)], [x.min(), x.max()], rtol=6e-4)
+
+
+def test_columns_are_coloured_by_the_number_that_is_asked_for(shown, written):
+    made, _ = written
+    columns = survey(made.folder, []).columns
+    colours = {}
+    for name in ("spread", "share"):
+        shown.select_option("#shade", name)
+        settle(shown)
+        values = columns[name].to_numpy() * (100 if name == "share" else 1)
+        label = shown.locator("#colour-bar").get_attribute("aria-label")
+        low, high = (float(text) for text in re.search(r"from (\S+) to (\S+)$", label).groups())
+        assert low == pytest.approx(values.min())
+        assert high == pytest.approx(np.sort(values)[int(np.ceil(0.95 * (len(values) - 1)))])
+        for index in (0, 2, 7):
+            share = (values[index] - low) / (high - low) if high > low else 0.5
+            colours[name, index] = pixel(shown, *on_map(shown, made, index))
+            np.testing.assert_allclose(colours[name, index], 255 * np.array(colormaps["viridis"](share)[:3]), atol=12)
+    assert colours["spread", 0] != colours["share", 0]
+
+
+def pixel(page, x: float, y: float) -> list[int]:
+    """The colour that is drawn over the image there."""
+    read = """([x, y]) => {
+        const pen = new OffscreenCanvas(1, 1).getContext("2d"), from = document.querySelector("#map canvas.overlay");
+        pen.drawImage(from, -Math.round(x * devicePixelRatio), -Math.round(y * devicePixelRatio));
+        return [...pen.getImageData(0, 0, 1, 1).data].slice(0, 3);
+    }"""
+    return page.evaluate(read, [x, y])
+
+
+def test_the_pointer_is_told_what_a_column_measures(shown, written):
+    made, _ = written
+    x, y = on_map(shown, made, 1)
+    shown.hover("#map", position={"x": x, "y": y})
+    told = shown.locator("#tip").inner_text().splitlines()
+    own = survey(made.folder, []).columns.isel(column_id=1)
+    assert told[0] == f"Column 2 {KIND}"
+    assert told[1] == f"x {float(own['x_ref']):.2f}, y {float(own['y_ref']):.2f} px"
+    assert number(told[2].removeprefix("spread ")) == pytest.approx(float(own["spread"]), rel=6e-3)
+    assert told[4] == "accepted 100 %"
+
+
+def test_a_dot_is_told_and_chooses_its_column(shown, written):
+    made, _ = written
+    columns = survey(made.folder, []).columns
+    order = np.lexsort([columns["spread"], columns["expected"]])
+    told = walk(shown, "spread", len(order))
+    pattern = r"stated error (\S+) pm, spread (\S+) pm"
+    values = np.array([re.fullmatch(pattern, one).groups() for (one,) in told], float)
+    np.testing.assert_allclose(values[:, 0], columns["expected"][order], rtol=6e-3)
+    np.testing.assert_allclose(values[:, 1], columns["spread"][order], rtol=6e-3)
+    shown.keyboard.press("Enter")
+    assert chosen(shown).split()[0] == str(int(columns["column_id"][order[-1]]))
+    settle(shown)
+    assert shown.locator("#share .chart-legend b").text_content() == "accepted 100 %, R² 0.8"
+
+
+def test_a_click_on_a_dot_chooses_its_column(shown):
+    canvas = shown.locator("#share canvas")
+    low = canvas.bounding_box()["height"] - 32 - 0.06 / 1.12 * (canvas.bounding_box()["height"] - 56)
+    for x in range(30, 120, 4):  # the weak column is at the lower left, beyond the axis' numbers
+        canvas.hover(position={"x": x, "y": low})
+        settle(shown)
+        if "accepted 25 %" in shown.locator("#share .chart-legend").text_content():
+            break
+    canvas.click(position={"x": x, "y": low})
+    assert chosen(shown) == "3 (Ce)"
+
+
+def test_curves_over_the_frames_are_those_of_the_dataset(shown, written):
+    made, _ = written
+    told = np.array([[number(value) for value in values] for values in walk(shown, "drift", N_FRAMES)])
+    np.testing.assert_allclose(told, PIXEL_PM * made.scene.drift[:, ::-1], rtol=6e-4, atol=1e-6)
+    n = len(made.scene.place)
+    share = [number(value) for (value,) in walk(shown, "accepted", N_FRAMES)]
+    accepted = np.where(np.arange(N_FRAMES) < N_FRAMES * 3 // 4, n - 1, n)
+    np.testing.assert_allclose(share, 100 * accepted / n, rtol=6e-4)
+
+
+def test_buttons_and_tables_choose_columns_and_zoom_is_shared(shown, written):
+    made, _ = written
+    n = len(made.scene.place)
+    click_column(shown, made, 0)
+    shown.click("#before")
+    assert chosen(shown) == f"{n} (Ce)"
+    shown.click("#after")
+    shown.click("#after")
+    assert chosen(shown) == f"2 ({KIND})"
+    shown.select_option("#column", label="6")
+    assert chosen(shown) == "6 (Ce)"
+    button = shown.locator(".go").first
+    button.click()
+    assert chosen(shown).split()[0] == button.text_content()
+    shown.focus("#x canvas")
+    shown.keyboard.press("+")
+    settle(shown)
+    assert shown.locator(".chart-whole:visible").count() == 3
+    shown.keyboard.press("0")
+    settle(shown)
+    assert shown.locator(".chart-whole:visible").count() == 0
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_page_follows_the_system_and_is_never_too_wide(chromium, written, theme):
+    with opened(chromium, f"file://{written[0].folder / 'report.html'}", theme) as page:
+        assert page.locator("html").get_attribute("data-theme") == theme
+        page.emulate_media(color_scheme="dark" if theme == "light" else "light")
+        settle(page)
+        assert page.locator("html").get_attribute("data-theme") != theme
+        page.set_viewport_size({"width": 390, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def _nothing_accepted(run):
+    run.values["status"][:] = Status.BELOW_NOISE
+
+
+def _not_calibrated(run):
+    run.about |= {"pixel_size_pm": None, "frame_time_s": None}
+
+
+@pytest.mark.parametrize(
+    ("change", "told", "dots"),
+    [
+        (_no_errors, r"^spread \S+ pm · accepted 100 %", 0),
+        (_nothing_accepted, "^accepted 0 % · residual", 0),
+        (_not_calibrated, r"^spread \S+ px · spread \S+ × stated error · accepted 100 %", 1),
+        (_outside, r"^spread \S+ pm · spread \S+ × stated error · accepted 100 %", 1),
+    ],
+)
+def test_what_is_not_known_is_left_out(chromium, tmp_path, change, told, dots):
+    made = Run(tmp_path)
+    change(made)
+    file = write_report(made.write(), figures=False)
+    with opened(chromium, f"file://{file}") as page:
+        page.select_option("#column", label="2")
+        settle(page)
+        assert re.search(told, page.locator("#said").text_content())
+        assert page.locator("#spread").count() == dots
+
+
+def test_the_page_works_as_the_service_shows_it(chromium, written):
+    made, _ = written
+    with opened(chromium, made.folder / "report.html", policy=_REPORT_POLICY) as page:
+        click_column(page, made, 4)
+        assert chosen(page) == "5 (Ce)"
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_report_is_made_anew_only_for_other_tracks(run):
+    assert not is_current(run.write())
+    write_report(run.folder)
+    assert is_current(run.folder)
+    metadata.update_attributes(run.folder / "results.zarr", dose=250.0)
+    assert not is_current(run.folder)
+
+
+def test_folder_without_tracks_is_refused(tmp_path):
+    with pytest.raises(StoreError, match="no results here"):
+        write_report(tmp_path)
+
+
+def test_every_setting_is_on_the_page():
+    rows = page.settings_rows(RunSettings())
+    names = {
+        f"{group.name}.{item.name}"
+        for group in dataclasses.fields(RunSettings())
+        for item in dataclasses.fields(getattr(RunSettings(), group.name))
+        if item.default is not dataclasses.MISSING  # not those of SLURM and ssh
+    }
+    assert {row["name"] for group in rows.values() for row in group} == names
+    assert not any(row["changed"] for group in rows.values() for row in group)

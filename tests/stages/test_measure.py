@@ -1,0 +1,258 @@
+"""The numbers of one shard against known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tract_dask import accepted, convert, fit_columns, open_movie
+from tract_dask.errors import SettingsError
+from tract_dask.kernels.gaussian.intensity import intensities
+from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
+from tract_dask.stages.fit.vacuum import find_vacuum
+from tract_dask.store.schema import Status
+
+FREE = FitSettings(shape="free")
+
+
+@pytest.fixture
+def make_movie(tmp_path, npy):
+    def make(frames, **metadata):
+        store = convert(
+            npy(frames),
+            tmp_path / "movie.zarr",
+            settings=ConvertSettings(tile_px=32),
+            metadata=MetadataSettings(**metadata),
+            overwrite=True,
+        )
+        return open_movie(store)
+
+    return make
+
+
+def position_bound(scene) -> float:
+    """Standard deviation of a position by the Cramer-Rao bound (major axis), px: an upper bound."""
+    signal = scene.amplitude**2 / (scene.background + scene.amplitude / 2)
+    return float(scene.sigma_a / np.sqrt(np.pi * scene.sigma_a * scene.sigma_b * signal / 2))
+
+
+def test_positions_and_shapes_match_the_truth(scene, make_movie):
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), FREE, refine_columns=None
+    ).compute()
+    away = tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place
+    assert away.std() <= 1.3 * position_bound(scene)
+    assert np.abs(away.mean(axis=0)).max() <= 4 * position_bound(scene) / np.sqrt(scene.n_frames)
+    widths = np.sqrt(np.array([scene.sigma_a, scene.sigma_b]) ** 2 + 2.0**2)  # the blur adds its variance
+    found = tracks.fit.sel(parameter=["sigma_a", "sigma_b"]).mean(("frame", "column_id")).to_numpy()
+    np.testing.assert_allclose(found, widths, rtol=0.02)
+    assert (tracks.status == 0).mean() > 0.99
+
+
+def test_centroids_are_nearly_as_good_as_fits(scene, make_movie):
+    """Drift-corrected, unbiased, and at most 1.3 times the bound: a mask of the best radius loses 13 % at least."""
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), refine_columns=None
+    ).compute()
+    away = tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place
+    assert away.std() <= 1.3 * position_bound(scene)
+    assert np.abs(away.mean(axis=0)).max() <= 4 * position_bound(scene) / np.sqrt(scene.n_frames)
+    assert away.std() >= (tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place).std()
+
+
+def test_centroids_are_not_masked_but_where_there_is_no_window_or_frame(scene, make_movie):
+    scene.drift[5] = (0, -18)
+    frames = scene.counts().astype(np.float32)
+    frames[7, 0, 0] = np.nan
+    tracks = fit_columns(
+        make_movie(frames), scene.columns(), scene.drift_dataset(), FitSettings(threshold=100), refine_columns=None
+    ).compute()
+    masked = accepted(tracks)
+    assert masked.fit.isnull().all()
+    lost = (tracks.status.to_numpy() & (Status.OUTSIDE_FRAME | Status.BAD_FRAME)) > 0
+    assert lost[5].any()
+    assert lost[7].all()
+    np.testing.assert_array_equal(masked.centroid.isnull().any("axis"), lost)
+
+
+def test_dark_columns_have_centroids(scene, make_movie):
+    scene.amplitude, scene.background = -60.0, 100.0
+    tracks = fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset()).compute()
+    assert (tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place).std() <= 0.3
+
+
+def test_a_small_mask_is_noisier(scene, make_movie):
+    movie = make_movie(scene.counts())
+    spread = {}
+    for radius in (None, 3.0):
+        settings = FitSettings(mask_radius_px=radius)
+        tracks = fit_columns(movie, scene.columns(), scene.drift_dataset(), settings, refine_columns=None).compute()
+        spread[radius] = (tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place).std()
+    assert spread[3.0] > 1.3 * spread[None]
+
+
+def test_positions_do_not_depend_on_the_drift(scene, make_movie):
+    """Windows move with the drift: a still scene and a drifting one give the same positions, noise-free, to 1e-3 px."""
+    scene.drift = scene.drift + 0.37
+    frames = np.array([scene.frame(shift) for shift in scene.drift], dtype=np.float32)
+    tracks = fit_columns(make_movie(frames), scene.columns(), scene.drift_dataset(), refine_columns=None).compute()
+    away = tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place
+    assert np.abs(away).max() <= 1e-2  # neighbours' tails bias a column, the same in every frame
+    assert away.std(axis=0).max() <= 1e-3
+
+
+def test_common_motion_refines_the_drift(scene, make_movie):
+    error = np.random.default_rng(3).normal(0, 0.5, (scene.n_frames, 2))
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(error), refine_columns=8
+    ).compute()
+    left = tracks.drift.to_numpy() - scene.drift
+    left -= left.mean(axis=0)
+    assert left.std() <= 1.5 * position_bound(scene) / np.sqrt(len(scene.place))
+    np.testing.assert_allclose(tracks.drift_measured, scene.drift + error)
+    raw = tracks.fit.sel(parameter=["x", "y"]).to_numpy() + tracks.drift.to_numpy()[:, None, ::-1]
+    assert (raw - scene.place - scene.drift[:, None, ::-1]).std() <= 1.3 * position_bound(scene)
+
+
+def test_too_few_columns_leave_the_drift_alone(scene, make_movie):
+    drift = scene.drift_dataset()
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), drift, refine_columns=len(scene.place) + 1
+    ).compute()
+    np.testing.assert_array_equal(tracks.drift, drift.drift)
+
+
+def test_absent_columns_are_flagged(scene, make_movie):
+    present = np.ones((scene.n_frames, len(scene.place)), bool)
+    present[3:7, 4] = False
+    summed = scene.summed()
+    movie = make_movie(scene.counts(present))
+    tracks = fit_columns(
+        movie, scene.columns(), scene.drift_dataset(), FitSettings(threshold=6), summed=summed, refine_columns=None
+    ).compute()
+    lost = tracks.status.to_numpy() != 0
+    assert lost[~present].all()
+    assert lost[present].mean() <= 0.01
+
+
+def test_a_sigma_on_its_bound_is_flagged_and_accepted(scene, make_movie):
+    columns = scene.columns()
+    columns["fit_ref"][:, [3, 4]] *= 0.6  # the true widths are beyond 1.3 times these
+    tracks = fit_columns(
+        make_movie(scene.counts()), columns, scene.drift_dataset(), FREE, refine_columns=None
+    ).compute()
+    assert (tracks.status == Status.SHAPE_AT_BOUND).mean() > 0.95
+    assert accepted(tracks).fit.sel(parameter="x").notnull().mean() > 0.95
+    limit = 1.3 * float(columns["fit_ref"][0, 3])
+    assert (tracks.fit.sel(parameter="sigma_a") <= limit * (1 + 1e-6)).all()
+
+
+def test_noise_is_that_of_blurred_vacuum(scene, make_movie):
+    """White noise of variance B, blurred with sigma s, has standard deviation sqrt(B) / (2 sqrt(pi) s)."""
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), summed=scene.summed()
+    ).compute()
+    expected = np.sqrt(scene.background) / (2 * np.sqrt(np.pi) * 2.0)
+    assert tracks.noise.mean().item() == pytest.approx(expected, rel=0.1)
+
+
+def test_columns_that_leave_the_frame_keep_their_place_in_the_table(scene, make_movie):
+    scene.drift[5] = (0, -18)
+    tracks = fit_columns(
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), refine_columns=None
+    ).compute()
+    gone = scene.place[:, 0] - 18 < 19 // 2 - 0.5
+    assert gone.any()
+    outside = (tracks.status.to_numpy() & Status.OUTSIDE_FRAME) > 0
+    np.testing.assert_array_equal(outside[5], gone)
+    assert np.isnan(tracks.fit.to_numpy()[5, gone]).all()
+    assert not outside[[0, 1, 2, 3, 4, 6, 7]].any()
+
+
+def test_frames_with_nan_are_bad_frames_and_the_rest_is_fitted(scene, make_movie):
+    frames = scene.counts().astype(np.float32)
+    x, y = np.rint(scene.place[2]).astype(int)
+    frames[4, y, x] = np.nan
+    frames[6] = np.inf
+    tracks = fit_columns(make_movie(frames), scene.columns(), scene.drift_dataset(), summed=scene.summed()).compute()
+    bad = (tracks.status.to_numpy() & Status.BAD_FRAME) > 0
+    np.testing.assert_array_equal(bad.all(axis=1), np.isin(np.arange(scene.n_frames), [4, 6]))
+    assert (bad.any(axis=1) == bad.all(axis=1)).all()
+    assert np.isfinite(tracks.fit.to_numpy()[4, 10]).all()
+    assert (tracks.status.to_numpy()[5] == 0).all()
+
+
+def test_dark_columns_have_negative_amplitude_and_intensity(scene, make_movie):
+    scene.amplitude, scene.background = -60.0, 100.0
+    tracks = fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset()).compute()
+    assert (tracks.fit.sel(parameter="amplitude") < 0).all()
+    assert (tracks.intensity < 0).all()
+    away = tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place
+    assert away.std() <= 0.25
+
+
+def test_gain_turns_detector_units_into_counts(scene, make_movie):
+    plain = fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset()).compute()
+    columns = scene.columns()
+    columns["fit_ref"][:, [0, 6]] *= 3.0
+    scaled = fit_columns(make_movie(scene.counts(), gain=3.0), columns, scene.drift_dataset()).compute()
+    np.testing.assert_allclose(scaled.intensity, 3.0 * plain.intensity, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("scale", "share"), [("paper", 0.9545**2), ("ellipse", 1 - np.exp(-2))])
+def test_intensity_is_the_integral_of_the_model(scale, share):
+    """Equations 3 and 5 against numerical integration of Equation 1."""
+    y, x = np.mgrid[-60:61, -60:61]
+    amplitude, sigma_a, sigma_b, background = 5.0, 6.0, 4.0, 2.0
+    total = (amplitude * np.exp(-0.5 * (x / sigma_a) ** 2 - 0.5 * (y / sigma_b) ** 2)).sum()
+    estimates = np.array([amplitude, 0, 0, sigma_a, sigma_b, 0, background])
+    intensity, error = intensities(estimates, scale)
+    assert intensity == pytest.approx(share * total, rel=1e-6)
+    assert error == pytest.approx(np.sqrt(intensity + 2 * background * np.pi * (2 * sigma_a) * (2 * sigma_b)))
+
+
+def test_vacuum_is_found_above_the_crystal_and_not_inside_it(scene):
+    y0, y1, x0, x1 = find_vacuum(scene.summed(), scene.columns(), 2.0)
+    assert y1 <= scene.place[:, 1].min() - 2 * scene.sigma_a
+    assert min(y1 - y0, x1 - x0) >= 24
+
+
+def test_padding_is_no_vacuum(scene):
+    summed = scene.summed()
+    summed["image"] += np.random.default_rng(0).normal(0, 1, summed["image"].shape)
+    padded = summed.pad(y=(0, 0), x=(0, 96), constant_values=0)  # a flat square larger than any of vacuum
+    padded["exposure"][:] = summed["exposure"].max()
+    y0, y1, x0, x1 = find_vacuum(padded, scene.columns(), 2.0)
+    assert x1 <= summed.sizes["x"] + 1
+    assert padded["image"][y0:y1, x0:x1].std() > 0
+
+
+def test_vacuum_without_noise_is_vacuum(scene):
+    summed = scene.summed()
+    summed["image"][:64] = summed["image"][:24].mean()  # no edge
+    y0, y1, x0, x1 = find_vacuum(summed, scene.columns(), 2.0)
+    assert summed["image"][y0:y1, x0:x1].std() == 0
+
+
+def test_a_field_without_vacuum_takes_its_noise_from_the_residuals(scene, make_movie):
+    left, top = scene.place.min(axis=0).astype(int)
+    right, bottom = scene.place.max(axis=0).astype(int)
+    crystal = scene.summed().isel(y=slice(top, bottom), x=slice(left, right))
+    assert find_vacuum(crystal, scene.columns(), 2.0) is None
+    tracks = fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset()).compute()
+    assert np.isfinite(tracks.noise).all()
+    assert (tracks.noise < 0.2 * scene.amplitude).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (FitSettings(window_px=20), "odd number"),
+        (FitSettings(window_px=301), "odd number"),
+        (FitSettings(vacuum_box=(0, 0, 10, 10)), "not a box"),
+        (FitSettings(vacuum_box=(0, 20, 0, 20)), "leaves frame"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_before_the_fits(scene, make_movie, settings, message):
+    with pytest.raises(SettingsError, match=message):
+        fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), settings)

@@ -1,0 +1,223 @@
+"""Keys that stay, and each stage's algorithm: number, defaults and results together."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from conftest import Scene
+
+from tract_dask.readers import open_source
+from tract_dask.settings import ConvertSettings, DriftSettings, FitSettings, RunSettings, Settings, setting
+from tract_dask.stages.columns.find import find_columns
+from tract_dask.stages.convert.origin import movie_key
+from tract_dask.stages.convert.stage import convert
+from tract_dask.stages.drift.stage import estimate_drift
+from tract_dask.stages.fit import job as fit_job
+from tract_dask.stages.fit import stage as fit_stage
+from tract_dask.stages.fit.job import Job
+from tract_dask.stages.sum import sum_image
+from tract_dask.store import keys, schema
+from tract_dask.store.keys import KEYED, OTHERWISE, Keyed, counted
+from tract_dask.store.movie import Movie, open_movie
+from tract_dask.store.provenance import ALGORITHMS, stage_key
+from tract_dask.store.results import open_results
+
+GOLDEN = Path(__file__).parent / "golden" / "algorithms.json"
+NUMBERS = np.arange(6, dtype=np.float64).reshape(2, 3) / 3
+DEFAULTS = RunSettings()
+
+
+# Keys that stay
+
+
+def groups_of(settings: RunSettings) -> dict[str, Settings]:
+    return {item.name: getattr(settings, item.name) for item in dataclasses.fields(settings)}
+
+
+@pytest.mark.parametrize(
+    ("parts", "key"),
+    [
+        (("convert", "content", {}), "f79bd03caceef8a7d56899cc6c298d531463fb2e49e5060fdb213a1a923fcf57"),
+        (
+            ("drift", "movie", {"drift.search_px": 12}),
+            "2dd84dd5e218d2a581d13bf124317e8fdee0fff7669bd382efb139e2291f5a35",
+        ),
+        (("sum", "movie", {}, 1.0, NUMBERS), "fbfd7e26e3758c4a56d18b6c341a303c6d7f6df213a6c917b015eeb68e85878b"),
+        (
+            ("columns", NUMBERS, {"columns.contrast": "dark", "fit.window_px": 21.0}, b"x,y\n1,2\n"),
+            "808e8e9b0ba2cf31bfefdb191cc9a9164c41b1e5cf613eb9a055fdc186fe11c7",
+        ),
+        (
+            ("fit", "movie", {}, NUMBERS, [1, 19, None, 10], ["Ce", "O"]),
+            "8c1924e979a9f4134da5db5193c347ea5cf5657573a50a0cdc699c562a4ae3fd",
+        ),
+    ],
+)
+def test_keys_are_frozen(parts, key):
+    """On every machine, and in every version: another key here throws the results of all users away."""
+    assert stage_key(*parts) == key
+
+
+def test_the_key_of_a_movie_is_frozen(tmp_path):
+    np.save(tmp_path / "movie.npy", np.arange(60, dtype="<u2").reshape(3, 4, 5))
+    assert (
+        movie_key(open_source(tmp_path / "movie.npy"))
+        == "745567a3502d8cce8053588b026669fedb2fc5d595311944cbfb1edee739750b"
+    )
+    layout = ConvertSettings(shard_mb=100, codec="zstd")
+    assert (
+        movie_key(open_source(tmp_path / "movie.npy"), layout)
+        == "5eeb80f1cea2f3b666e733acbce7968b0ebd7e3e4b2276d5b5a00af5065b99d8"
+    )
+
+
+def test_the_key_of_a_fit_is_frozen():
+    movie = Movie(
+        path=Path("movie.zarr"),
+        shape=(3, 40, 40),
+        dtype=np.dtype("u2"),
+        key="movie",
+        frames_per_shard=1,
+        bins=(),
+        pixel_size_pm=None,
+        frame_time_s=None,
+        dose=None,
+        gain=1.0,
+    )
+    columns = xr.Dataset({"kind": ("column_id", schema.texts(["Ce", ""]))}, {"column_id": [1, 2]})
+    job = Job(np.ones((2, 7)), np.zeros((3, 2)), np.zeros(3, bool), 19, (0, 9, 0, 9), 10, FitSettings(threshold=2))
+    assert fit_stage.fit_key(movie, columns, job) == "1bf85792099b4b6760b828308988d32ec8369a75a56ef99bd254259a823f52a9"
+
+
+def test_numbers_and_bytes_count_by_value():
+    assert stage_key("sum", 1, [2]) == stage_key("sum", 1.0, [2.0])
+    assert stage_key("sum", NUMBERS) == stage_key("sum", NUMBERS.astype(">f8"))
+    assert stage_key("sum", NUMBERS) != stage_key("sum", NUMBERS.T)
+    assert stage_key("sum", NUMBERS) != stage_key("sum", NUMBERS.astype("f4"))
+
+
+# What counts
+
+
+def test_defaults_are_in_no_key():
+    assert {stage: counted(stage, **groups_of(DEFAULTS)) for stage in ALGORITHMS} == {stage: {} for stage in ALGORITHMS}
+
+
+def test_every_stage_has_a_number_and_settings():
+    assert ALGORITHMS.keys() == KEYED.keys()
+
+
+@pytest.mark.parametrize("group", ["source", "metadata", "convert", "drift", "columns", "fit"])
+def test_every_setting_counts_in_some_way(group):
+    """A new setting needs a line in tract_dask/store/keys.py, with its default, for each stage that it changes."""
+    settings = getattr(DEFAULTS, group)
+    places = {item.place or item.name for items in KEYED.values() for item in items} | OTHERWISE.keys()
+    assert {f"{group}.{item.name}" for item in dataclasses.fields(settings)} <= places
+
+
+@pytest.mark.parametrize("stage", KEYED)
+def test_a_setting_that_differs_is_in_the_key_of_its_stage(stage):
+    other = {bool: lambda value: not value, str: lambda value: value + "x", float: lambda value: value + 1}
+    for item in KEYED[stage]:
+        group, _, field = (item.place or item.name).partition(".")
+        value = keys.plain(getattr(getattr(DEFAULTS, group), field))
+        changed = other.get(type(value), lambda _: [1.0])(value)
+        groups = groups_of(DEFAULTS) | {group: _Changed(getattr(DEFAULTS, group), field, changed)}
+        assert counted(stage, **groups) == {item.name: changed}
+
+
+class _Changed:
+    """Settings of which one is another, unchecked."""
+
+    def __init__(self, settings: Settings, field: str, value: Any) -> None:
+        self._settings = settings
+        setattr(self, field, value)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._settings, name)
+
+
+def test_a_setting_may_be_new_move_and_be_renamed(monkeypatch):
+    """With its default it changes no key; elsewhere and under another name it is still the same setting."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Registration(Settings):
+        reach_px: float | None = setting(None, "Largest step")
+        passes: int = setting(2, "New in this version")
+
+    before = stage_key("drift", "movie", counted("drift", drift=DriftSettings(search_px=9)))
+    moved = (
+        Keyed("drift.method", "auto"),
+        Keyed("drift.search_px", None, "registration.reach_px"),
+        Keyed("drift.passes", 2, "registration.passes"),
+    )
+    monkeypatch.setitem(KEYED, "drift", moved)
+    groups = {"drift": DriftSettings(), "registration": Registration(reach_px=9)}
+    assert stage_key("drift", "movie", counted("drift", **groups)) == before
+
+
+def test_a_number_that_is_raised_changes_the_key_of_its_stage_alone(monkeypatch):
+    before = {stage: stage_key(stage, "x") for stage in ALGORITHMS}
+    monkeypatch.setitem(ALGORITHMS, "fit", ALGORITHMS["fit"] + 1)
+    assert [stage for stage in ALGORITHMS if stage_key(stage, "x") != before[stage]] == ["fit"]
+
+
+# Number, defaults and results together
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> dict[str, list[float]]:
+    """Results of every stage with its defaults, on one small movie; each from the truth of the stages before it."""
+    folder, scene = tmp_path_factory.mktemp("algorithms"), Scene(n_frames=16, seed=5)
+    np.save(folder / "movie.npy", scene.counts())
+    movie = open_movie(convert(folder / "movie.npy", folder / "movie.zarr"))
+    drift, truth, image = estimate_drift(movie), scene.drift_dataset(), scene.summed()
+    summed, columns = sum_image(movie, truth), find_columns(image)
+    job = fit_job.prepare(movie, scene.columns(), truth, FitSettings(), summed=image)
+    fit_stage.fit_movie(movie, scene.columns(), job, folder / "results.zarr")
+    tracks = open_results(folder / "results.zarr").load()
+    level = movie.read_binned(4, 0, 2)
+    return {
+        "convert": [
+            *(movie.frames_per_shard, *movie.bins, *movie.read(3, 4)[0, 70, 40:44]),
+            *(*level[1, 20, 10:14], *movie.statistics()["frame_mean"].to_numpy()[:3]),
+        ],
+        "drift": drift["drift"].to_numpy()[::4].ravel().tolist() + drift["quality"].to_numpy()[::4].tolist(),
+        "sum": [*summed["image"].to_numpy()[70:130:20, 40], *summed["exposure"].to_numpy()[:4, 0]],
+        "columns": [*columns["fit_ref"].to_numpy()[::5].ravel(), columns.attrs["spacing_px"]],
+        "fit": [
+            *tracks["fit"].to_numpy()[::5, ::6, :3].ravel(),
+            *tracks["intensity"].to_numpy()[::5, ::6].ravel(),
+            *tracks["stderr"].to_numpy()[::5, ::6, 1].ravel(),
+            *tracks["noise"].to_numpy()[::5],
+        ],
+    }
+
+
+@pytest.mark.parametrize("stage", ALGORITHMS)
+def test_number_defaults_and_results_of_a_stage_change_together(stage, results):
+    golden = json.loads(GOLDEN.read_text())[stage]
+    number = str(ALGORITHMS[stage])
+    defaults = {item.name: keys.plain(_default(item)) for item in KEYED[stage]}
+    found = {"defaults": defaults, "results": [float(f"{value:.5g}") for value in results[stage]]}
+    told = (
+        f"The defaults or the results of stage {stage} are not those of its algorithm {number}. If that is meant, raise"
+        f" ALGORITHMS[{stage!r}] in tract_dask/store/provenance.py to {max(map(int, golden), default=0) + 1}, change the"
+        f" defaults in tract_dask/store/keys.py too, and add this under that number to {GOLDEN.name}, where entries stay:\n"
+        f"{json.dumps(found)}"
+    )
+    assert number in golden, told
+    assert max(map(int, golden)) == int(number), told
+    released = golden[number]
+    assert {name: defaults.get(name) for name in released["defaults"]} == released["defaults"], told
+    assert {name: keys.default_of(stage, name) for name in defaults} == defaults, told
+    np.testing.assert_allclose(results[stage], released["results"], rtol=2e-4, atol=2e-4, err_msg=told)
+
+
+def _default(item: Keyed) -> Any:
+    group, _, field = (item.place or item.name).partition(".")
+    return getattr(getattr(DEFAULTS, group), field)

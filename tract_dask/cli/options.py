@@ -1,0 +1,244 @@
+"""Options of the command line, made from the declarations of the settings: one declaration, one name, one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import tomllib
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from ..settings import declare, toml
+from ..settings.declare import Settings
+from ..settings.run import TITLES, RunSettings
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+IMPLIED = {("columns", "csv"): "csv", ("columns", "lattices"): "lattice", ("drift", "csv"): "csv"}
+"""Settings that say which method is meant where none is given."""
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Return whole numbers that have commas between them.
+
+    Examples
+    --------
+    >>> numbers("0,64,0,64")
+    (0, 64, 0, 64)
+    """
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise click.BadParameter(
+            f"{text!r} is not whole numbers with commas between them, such as 0,64,0,64"
+        ) from error
+
+
+def toml_list(text: str) -> tuple[Any, ...]:
+    """Return a list that is written as in TOML."""
+    try:
+        found = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError as error:
+        raise click.BadParameter(f"{text!r} is not TOML: {error}") from error
+    if not isinstance(found, list):
+        raise click.BadParameter(f"{text!r} is not a list, such as [{{origin = [10, 10]}}]")
+    return tuple(found)
+
+
+class SettingOption(click.Option):
+    """An option that stands under the heading of its group."""
+
+    heading = ""
+
+
+class Command(click.Command):
+    """A command whose help lists its options under the headings of their groups."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, group by group."""
+        sections: dict[str, list[tuple[str, str]]] = {"Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx) if isinstance(parameter, click.Option) else None
+            if record:
+                sections.setdefault(getattr(parameter, "heading", "Options"), []).append(record)
+        for heading, records in sections.items():
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+def setting_options(*groups: str) -> Callable[[F], F]:
+    """Give a command an option for every setting of ``groups``, and ``--config``; it receives them as ``settings``.
+
+    A group is named as in :class:`RunSettings`; ``group.name`` stands for one setting of it.
+    """
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def command(*args: Any, config: Path | None, **values: Any) -> Any:
+            given = {name: values.pop(name) for name in list(values) if "__" in name}
+            settings = collect(given, config, values.pop("cluster_file", None))
+            return function(*args, settings=settings, **values)
+
+        decorated: Any = command
+        for group in reversed(groups):
+            for option in reversed(_group_options(group)):
+                decorated = option(decorated)
+        return typing.cast(
+            "F",
+            click.option(
+                "--config",
+                type=click.Path(dir_okay=False, path_type=Path),
+                help="Settings to start from, such as the run.toml of an earlier run; options override them.",
+            )(decorated),
+        )
+
+    return decorate
+
+
+def class_options(
+    kind: type[Settings],
+    name: str,
+    heading: str,
+    *,
+    presets: Mapping[str, Settings] | None = None,
+    without: tuple[str, ...] = (),
+) -> Callable[[F], F]:
+    """Give a command an option for every setting of a class that is no part of a run's settings.
+
+    Parameters
+    ----------
+    kind, name
+        The class, and the argument in which the command receives an instance.
+    heading
+        Of the options in the help.
+    presets
+        Instances to choose from with ``--preset``, the first by default; options override what it says.
+    without
+        Settings that get no option.
+    """
+    cls = type("ClassOption", (SettingOption,), {"heading": heading})
+    fields = [field for field in _fields(kind) if field[0].name not in without]
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def command(*args: Any, **values: Any) -> Any:
+            start = presets[values.pop("preset")] if presets else kind()
+            given = {item.name: values.pop(f"{name}__{item.name}") for item, _ in fields}
+            changes = {option: value for option, value in given.items() if value is not None}
+            return function(*args, **{name: dataclasses.replace(start, **changes)}, **values)
+
+        decorated: Any = command
+        for field in reversed(fields):
+            decorated = _option(name, field, cls)(decorated)
+        if presets:
+            first, *_ = presets
+            text = f"The settings to start from; the options below override them. [{first}]."
+            choice = click.Choice(tuple(presets))
+            decorated = click.option("--preset", type=choice, default=first, cls=cls, help=text)(decorated)
+        return typing.cast("F", decorated)
+
+    return decorate
+
+
+def collect(given: dict[str, Any], config: Path | None = None, cluster_file: Path | None = None) -> RunSettings:
+    """Return the settings in the file ``config``, or the defaults, with those options in their place that were given.
+
+    Parameters
+    ----------
+    given
+        Values by ``group__name``; None where the option was not given.
+    config
+        A TOML file.
+    cluster_file
+        A TOML file of the cluster's settings alone, which replaces what ``config`` says of it.
+
+    Raises
+    ------
+    SettingsError
+        Where a value is out of range, or the file cannot be used.
+
+    Examples
+    --------
+    >>> collect({"columns__csv": "seeds.csv", "columns__method": None}).columns.method
+    'csv'
+    """
+    settings = toml.load(config) if config else RunSettings()
+    if cluster_file:
+        settings = dataclasses.replace(settings, cluster=toml.load_cluster(cluster_file))
+    changes: dict[str, dict[str, Any]] = {}
+    if given.pop("drift__off", False):
+        given["drift__method"] = "none"
+    for name, value in given.items():
+        group, field = name.split("__")
+        if value is not None:
+            changes.setdefault(group, {})[field] = value
+            if (group, field) in IMPLIED and given.get(f"{group}__method") is None:
+                changes[group]["method"] = IMPLIED[group, field]
+    updated = {group: dataclasses.replace(getattr(settings, group), **fields) for group, fields in changes.items()}
+    return dataclasses.replace(settings, **updated)
+
+
+def _group_options(name: str) -> list[Callable[[Any], Any]]:
+    group, _, only = name.partition(".")
+    kinds = typing.get_type_hints(RunSettings)
+    heading = type("GroupOption", (SettingOption,), {"heading": TITLES[group]})
+    options = [_option(group, field, heading) for field in _fields(kinds[group]) if only in ("", field[0].name)]
+    if name == "drift":
+        options.append(
+            click.option("--no-drift", "drift__off", is_flag=True, cls=heading, help="Same as --drift none.")
+        )
+    if name == "cluster":
+        options.insert(0, _cluster_option(heading))
+    return options
+
+
+def _cluster_option(cls: type[click.Option]) -> Callable[[Any], Any]:
+    path = click.Path(dir_okay=False, path_type=Path)
+    text = "TOML file of the cluster: SLURM, ssh and more (docs/deploy.md); options override it."
+    return click.option("--cluster", "cluster_file", type=path, cls=cls, help=text)
+
+
+def _fields(kind: type[Settings]) -> list[tuple[dataclasses.Field[Any], Any]]:
+    """Return the settings of a class that have an option, with their types."""
+    kinds = typing.get_type_hints(kind)
+    return [(field, kinds[field.name]) for field in dataclasses.fields(kind) if not field.metadata["in_files_only"]]
+
+
+def _option(group: str, field: tuple[dataclasses.Field[Any], Any], cls: type[click.Option]) -> Callable[[Any], Any]:
+    item, annotation = field
+    meta = item.metadata
+    flag = meta["flag"] or "--" + item.name.replace("_", "-")
+    plain = declare.plain_type(annotation)
+    more: dict[str, Any] = {}
+    if plain is bool:
+        flag = f"{flag}/--no-{flag[2:]}"
+        default = "on" if item.default else "off"
+    else:
+        default = "" if item.default in (None, ()) else f"{item.default:g}" if plain is float else f"{item.default}"
+        more["type"] = click.Choice(meta["choices"]) if meta["choices"] else _click_type(plain, annotation)
+        more["metavar"] = None if meta["choices"] else _metavar(item.name, plain, annotation, meta["unit"])
+    text = meta["description"] + (f" [{default}]" if default else "") + "."
+    return click.option(flag, f"{group}__{item.name}", default=None, cls=cls, help=text, **more)
+
+
+def _click_type(plain: Any, annotation: Any) -> Any:
+    if plain is tuple:
+        return toml_list if _free(annotation) else numbers
+    return {int: click.INT, float: click.FLOAT, str: click.STRING}[plain]
+
+
+def _metavar(name: str, plain: Any, annotation: Any, unit: str) -> str:
+    if plain is tuple:
+        return "LIST" if _free(annotation) else "N,N,..."
+    if name.endswith(("csv", "file")):
+        return "FILE"
+    return unit.upper() if unit else {int: "N", float: "NUMBER", str: "TEXT"}[plain]
+
+
+def _free(annotation: Any) -> bool:
+    """Tell whether a tuple may hold anything, not only whole numbers."""
+    return Any in typing.get_args(annotation)

@@ -1,0 +1,1 @@
+"""Who does the work: workers here, over SSH or SLURM, and the tasks that they get."""

@@ -1,0 +1,1 @@
+"""The fit of elliptical Gaussians: model, iteration, errors."""

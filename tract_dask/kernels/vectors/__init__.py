@@ -1,0 +1,1 @@
+"""Programs for the processor's vectors, traced from Python."""

@@ -1,0 +1,228 @@
+"""Readers: one file a format behind one small protocol.
+
+A format is a function from a path to a :class:`~tract_dask.readers.source.Source` and its line in :data:`READERS`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import chain
+from pathlib import Path
+from typing import TypeAlias
+
+from ..errors import SourceError
+from ..settings.run import MetadataSettings, SourceSettings
+from .hdf5 import open_hdf5
+from .listing import FileList, is_pattern, list_files
+from .mrc import open_mrc
+from .npy import open_npy
+from .raw import open_raw
+from .sequence import SequenceSource, open_sequence
+from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
+from .tiff import open_tiff
+
+__all__ = [
+    "READERS",
+    "FileList",
+    "FrameSource",
+    "Permit",
+    "SourceMetadata",
+    "files_named_now",
+    "list_files",
+    "open_cached",
+    "open_source",
+    "unknown_format",
+]
+
+Opener: TypeAlias = Callable[[Path, str, SourceSettings], Source]
+"""Takes a file, the path inside it (HDF5 only), and how to read it; makes every check."""
+
+READERS: dict[str, Opener] = {
+    ".tif": open_tiff,
+    ".tiff": open_tiff,
+    ".mrc": open_mrc,
+    ".mrcs": open_mrc,
+    ".st": open_mrc,
+    ".npy": open_npy,
+    ".h5": open_hdf5,
+    ".hdf5": open_hdf5,
+    ".hspy": open_hdf5,
+    ".raw": open_raw,
+    ".bin": open_raw,
+    ".dat": open_raw,
+}
+
+DECLARED_NOTHING = SourceSettings()
+AS_THE_FILE_SAYS = MetadataSettings()
+
+_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
+
+
+def open_source(
+    path: Path | str | FileList | Sequence[Path | str],
+    settings: SourceSettings = DECLARED_NOTHING,
+    metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
+) -> FrameSource:
+    """Open a movie: a file, ``file.h5::/path/in/file``, a folder, a pattern for the files of one folder, or a list.
+
+    Everything that can be wrong with it is found here, before any work.
+
+    Parameters
+    ----------
+    path
+        What to open. In a folder, all files of its one readable format; of several files, the frames in their order.
+        A path that is there is never taken for a pattern. A :class:`FileList` is opened as it is.
+    settings
+        Shape and type of raw files.
+    metadata
+        What the user knows better than the file.
+    permit
+        Called with the resolved path of every file before it is opened, also of those that links inside of HDF5 files
+        lead to; raises to refuse it. It is asked again where the files of a sequence are opened to be read.
+
+    Returns
+    -------
+    FrameSource
+        Frames (frames, y, x), read on demand.
+
+    Raises
+    ------
+    SourceError
+        Where the movie is missing, damaged, or not a movie; with file, place and remedy.
+    SettingsError
+        Where a raw file is not, or wrongly, declared.
+    """
+    place = path if isinstance(path, FileList) else str(path) if isinstance(path, str | Path) else list(map(str, path))
+    name = next(iter(place), "an empty list") if isinstance(place, list) else str(place)
+    with reading(name):
+        source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
+    known = source.metadata
+    merged = SourceMetadata(
+        pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
+        frame_time_s=known.frame_time_s if metadata.frame_time_s is None else metadata.frame_time_s,
+        dose=metadata.dose,
+        gain=metadata.gain,
+        notes=known.notes,
+    )
+    listed = tuple(place) if isinstance(place, list) else ()
+    return replace(source, path=name, metadata=merged, listed=listed, permit=permit)
+
+
+def open_cached(
+    path: str | Path | FileList | tuple[str | Path, ...],
+    settings: SourceSettings = DECLARED_NOTHING,
+    metadata: MetadataSettings = AS_THE_FILE_SAYS,
+    *,
+    permit: Permit | None = None,
+) -> FrameSource:
+    """Open a movie as :func:`open_source` does, or return it as this process last opened it, unless it has changed.
+
+    For tasks, each of which opens the movie anew: to walk along 10,000 pages takes a while, to ask for a file's time
+    does not.
+    """
+    first = path[0] if isinstance(path, tuple) and path else path
+    place = Path(_split(str(first))[0])
+    status = next((at.stat() for at in (place, place.parent) if at.exists()), None)
+    stamp = (status.st_size, status.st_mtime_ns) if status else None
+    return _open_stamped(path if isinstance(path, tuple | FileList) else str(path), settings, metadata, permit, stamp)
+
+
+@lru_cache(maxsize=4)
+def _open_stamped(
+    path: str | FileList | tuple[str | Path, ...],
+    settings: SourceSettings,
+    metadata: MetadataSettings,
+    permit: Permit | None,
+    stamp: tuple[int, int] | None,
+) -> FrameSource:
+    return open_source(path, settings, metadata, permit=permit)
+
+
+def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None) -> Source:
+    name = str(path)
+    outer, inner = _split(name)
+    open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
+    listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
+    return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
+
+
+def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, ...]] | None:
+    """Return the files that a movie's folder or pattern named when it was opened, and those that it names now.
+
+    None for a movie of one file, or of a list of files.
+
+    Raises
+    ------
+    SourceError
+        Where a folder holds files of several formats now, or cannot be read.
+    """
+    if source.listed or not isinstance(source, SequenceSource):
+        return None
+    with reading(source.path):
+        found = list_files(source.path, Path(_split(source.path)[0]), READERS)
+    return source.parts, found.files if found else ()
+
+
+def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None) -> Source:
+    """Open files as one movie in the order of the list; all have the same path inside."""
+    split = [_split(name) for name in names]
+    inside = {inner for _, inner in split}
+    if len(inside) > 1:
+        raise SourceError(
+            "the files of a list have different paths inside",
+            names[0],
+            "one path",
+            ", ".join(repr(path) for path in sorted(inside)[:9]),
+            "Name the same data set in each of them",
+        )
+    open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return the path of a file, and the path inside it after two colons; a file whose name has colons is that file."""
+    ends = [match.start() for match in re.finditer("::", name)]
+    there = [end for end in (len(name), *reversed(ends)) if os.path.lexists(name[:end])]
+    files = (end for end in there if not name[:end].endswith("/"))
+    fitting = (end for end in (*ends, len(name)) if is_pattern(Path(name[:end])))
+    end = next(chain(files, fitting, there), ends[0] if ends else len(name))
+    return name[:end], name[end + 2 :]
+
+
+def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
+    checked_file(path, permit)
+    suffix = path.suffix.lower()
+    declared = settings.raw_shape is not None and settings.raw_dtype is not None
+    opener = READERS.get(suffix, open_raw if declared else None)
+    if opener is None:
+        raise unknown_format(path)
+    if inner and opener is not open_hdf5:
+        raise SourceError(
+            "only HDF5 files have paths inside",
+            f"{path}::{inner}",
+            "the file's name alone",
+            f"the path {inner}",
+            f"Open {path}",
+        )
+    with reading(str(path)):
+        return open_hdf5(path, inner, settings, permit=permit) if opener is open_hdf5 else opener(path, inner, settings)
+
+
+def unknown_format(path: Path) -> SourceError:
+    """Return the error for a file that no reader opens."""
+    suffix = path.suffix.lower()
+    return SourceError(
+        f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
+        str(path),
+        f"a name that ends in one of {', '.join(READERS)}",
+        suffix or "a name without a suffix",
+        "Export the movie as TIFF or MRC"
+        if suffix in _VENDORS
+        else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
+    )

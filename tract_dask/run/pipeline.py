@@ -1,0 +1,298 @@
+"""The stages strung together: a run from a movie on disk to tracks, its plan, and every stage as a job of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import xarray as xr
+from distributed import Client
+
+from ..cluster.tries import persist
+from ..progress import (
+    REPORT,
+    JsonLines,
+    Sink,
+    StageDone,
+    StageStarted,
+    Warned,
+    silent,
+    tee,
+)
+from ..readers.listing import FileList
+from ..readers.source import FrameSource, Permit
+from ..settings.run import RunSettings
+from ..settings.toml import to_toml
+from ..stages.columns.stage import check_edited, clear_columns, columns_stage
+from ..stages.convert.origin import is_movie_of
+from ..stages.convert.stage import convert_stage
+from ..stages.drift.stage import drift_stage
+from ..stages.fit.stage import FitSummary, fit_stage
+from ..stages.sum import sum_stage
+from ..store import files, metadata
+from ..store.journal import journal_beside, remove_journal
+from ..store.movie import Movie
+from ..store.run_folder import RunFolder, sole_run
+from .checks import (
+    check_fit,
+    check_inputs,
+    check_output,
+    check_pixels_of,
+    check_stage,
+    open_input,
+    with_whole_paths,
+)
+from .plan import Plan, expected_limit, plan_run
+from .session import Record, Session
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a run did.
+
+    Attributes
+    ----------
+    state
+        ``planned``, ``stopped`` (after the stage that was asked for), ``done`` or ``done_with_bad_frames``.
+    seconds
+        Time of every stage that worked, in s.
+    reused
+        Stages that an earlier run had finished.
+    """
+
+    outputs: RunFolder
+    plan: Plan
+    state: str
+    frames: int
+    columns: int = 0
+    fits: int = 0
+    accepted: int = 0
+    bad_frames: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    reused: tuple[str, ...] = ()
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the outcome as a JSON-ready mapping."""
+        return dataclasses.asdict(self) | {"outputs": self.outputs.paths(), "reused": list(self.reused)}
+
+
+def run(
+    source: str | Path | FileList,
+    output: str | Path,
+    settings: RunSettings | None = None,
+    *,
+    client: Client | None = None,
+    on_event: Sink = silent,
+    overwrite: bool = False,
+    plan_only: bool = False,
+    report: bool = True,
+    until: str | None = None,
+    patience_s: float = 0.0,
+    permit: Permit | None = None,
+) -> RunOutcome:
+    """Turn a movie on disk into tracks: convert, drift, sum, columns, fit.
+
+    What an earlier run with the same settings has done is kept; changed settings redo what they affect, but a finished
+    conversion is thrown away with ``overwrite`` only. A table of columns that was edited by hand is kept, and fitted,
+    until the method or the file of columns changes.
+
+    Once the movie is converted, its source may be moved or archived.
+
+    Parameters
+    ----------
+    source
+        Any movie that :func:`tract_dask.open_source` reads.
+    output
+        A folder; see :class:`Outputs`.
+    client
+        The cluster to run on; None: the one that ``settings.cluster`` names, if there is anything to do.
+    on_event
+        Takes the run's progress. What it raises ends the run, which goes on from there as after any other error.
+    overwrite
+        Begin anew, even where the folder holds something else, or a movie that was converted otherwise. A table of
+        columns that was edited by hand stays, with the same movie, or is put away.
+    plan_only
+        Only plan, and write nothing.
+    report
+        Write ``report.html`` at the end, where it is not there yet or of other tracks.
+    until
+        The stage to stop after, one of :data:`tract_dask.progress.STAGES`; the same call without it goes on. After
+        ``columns``, the table can be edited first.
+    patience_s
+        How long to wait for another run in the same folder to end, in s.
+    permit
+        Called with the resolved path of every file of the source before it is opened.
+
+    Raises
+    ------
+    InputError
+        Where the source, the settings or the folder cannot be used; nothing is written then.
+    ClusterError
+        Where the cluster cannot do the work.
+    TractError
+        Where a stage fails; what is done is kept, and the same call goes on from there.
+    """
+    settings = with_whole_paths(settings or RunSettings())
+    outputs = RunFolder(Path(output).absolute())
+    check_stage(until)
+    attempt = partial(persist, send=on_event, file=str(outputs.root))
+    opening = partial(open_input, source, settings, None if overwrite else outputs.movie, permit)
+    with closing(attempt(opening)) as opened:
+        attempt(partial(check_inputs, opened.shape, settings))
+        if plan_only:
+            plan = plan_run(opened.shape, opened.dtype, settings, expected_limit(settings, client))
+            return RunOutcome(outputs, plan, "planned", plan.frames)
+        attempt(partial(check_output, outputs, opened, settings, overwrite=overwrite))
+        with ExitStack() as stack:
+            attempt(lambda: stack.enter_context(sole_run(outputs, patience_s)))
+            if overwrite:
+                same = attempt(lambda: metadata.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened))
+                attempt(partial(clear_run, outputs, on_event, keep_edited=same))
+            attempt(partial(check_edited, outputs.columns, settings.columns, opened.shape[1:]))
+            return _run(opened, outputs, settings, client, on_event, report=report, until=until)
+
+
+def _run(
+    source: FrameSource,
+    outputs: RunFolder,
+    settings: RunSettings,
+    client: Client | None,
+    on_event: Sink,
+    *,
+    report: bool,
+    until: str | None,
+) -> RunOutcome:
+    """Run the stages in their order, and stop after ``until``."""
+    record, made = Record(), _Made()
+    send = tee((record, JsonLines(outputs.events, on_event), on_event))
+    plan = plan_run(source.shape, source.dtype, settings)
+    with Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
+        session.attempt(partial(files.write_aside, outputs.settings, _run_toml(settings, {}).encode()))
+        for stage in _stages(source, outputs, settings, session, made):
+            if stage == until:
+                break
+        session.finish_aside()
+        if made.movie is None or made.summary is None:
+            session.state = "stopped"
+        else:
+            session.attempt(partial(_complete_toml, outputs, settings, made.movie, made.columns))
+            session.state = "done_with_bad_frames" if made.summary.bad_frames else "done"
+            session.message = "" if record.seconds else "all was done before: nothing to do"
+            if report:
+                _report(outputs, session)
+    summary = made.summary or FitSummary(0, 0, 0)
+    return RunOutcome(
+        outputs,
+        plan,
+        session.state,
+        plan.frames,
+        made.columns.sizes.get("column_id", 0),
+        summary.fits,
+        summary.accepted,
+        summary.bad_frames,
+        record.seconds,
+        record.reused,
+    )
+
+
+@dataclass
+class _Made:
+    """What the stages of a run have made so far."""
+
+    movie: Movie | None = None
+    columns: xr.Dataset = field(default_factory=xr.Dataset)
+    summary: FitSummary | None = None
+
+
+def _stages(
+    source: FrameSource, outputs: RunFolder, settings: RunSettings, session: Session, made: _Made
+) -> Iterator[str]:
+    """Run the stages one by one; yield the name of each when it is done."""
+    attempt, workers, send = session.attempt, session.workers, session.send
+    made.movie = movie = attempt(partial(convert_stage, source, outputs.movie, settings, workers, send))
+    attempt(partial(check_pixels_of, movie, settings.fit))
+    yield "convert"
+    drift = attempt(partial(drift_stage, movie, outputs.drift, settings.drift, workers, send))
+    check_fit(movie.shape[1:], settings.fit, drift["drift"].to_numpy())
+    yield "drift"
+    summed = attempt(partial(sum_stage, movie, drift, outputs.sum, workers, send))
+    yield "sum"
+    session.finish_aside()  # it imports what comes next: two threads could meet in packages that import each other
+    found = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
+    made.columns = columns = attempt(found)
+    yield "columns"
+    refine = refine_columns_of(settings)
+    made.summary = attempt(
+        partial(fit_stage, movie, columns, drift, summed, outputs.results, settings.fit, refine, workers, send)
+    )
+    yield "fit"
+
+
+def _complete_toml(outputs: RunFolder, settings: RunSettings, movie: Movie, columns: xr.Dataset) -> None:
+    """Write the settings once more, with what the data gave for those that were unset."""
+    files.write_aside(outputs.settings, _run_toml(settings, _resolved(movie, columns, outputs)).encode())
+
+
+def _report(outputs: RunFolder, session: Session) -> None:
+    """Write the report, if there is none of these tracks; whatever goes wrong, the tracks are done."""
+    from ..report.page import is_current, write_report  # takes its time to import
+
+    send = session.send
+    send(StageStarted(REPORT, 0))
+    began, current = perf_counter(), False
+    try:
+        current = session.attempt(partial(is_current, outputs.root))
+        if not current:
+            session.attempt(partial(write_report, outputs.root, figures=False))
+    except Exception as error:  # noqa: BLE001  nothing in a page of figures may undo a finished run
+        files.remove(outputs.report)  # it would be of other tracks
+        send(Warned(f"the report could not be made: {error}"))
+    send(StageDone(REPORT, perf_counter() - began, reused=current))
+
+
+def refine_columns_of(settings: RunSettings) -> int | None:
+    return settings.drift.refine_columns if settings.drift.refine and settings.drift.method != "none" else None
+
+
+def clear_run(outputs: RunFolder, on_event: Sink = silent, *, keep_edited: bool = False) -> None:
+    """Delete what a run writes, and nothing else; columns that were edited by hand are kept, or put away."""
+    clear_columns(outputs.columns, on_event, keep_edited=keep_edited)
+    stages = (outputs.movie, outputs.drift, outputs.sum, outputs.results)
+    for path in stages:
+        remove_journal(journal_beside(path))
+        files.remove(path)
+    for path in (outputs.report, outputs.settings, outputs.events):
+        files.remove(path)
+
+
+def _resolved(movie: Movie, columns: xr.Dataset, outputs: RunFolder) -> dict[str, Any]:
+    """Return what the data gave for settings that were unset."""
+    about = metadata.attributes(outputs.results)
+    found = {
+        "metadata.pixel_size_pm": movie.pixel_size_pm,
+        "metadata.frame_time_s": movie.frame_time_s,
+        "metadata.dose": movie.dose,
+        "columns.spacing_px": columns.attrs.get("spacing_px"),
+        "fit.window_px": about.get("window"),
+        "fit.vacuum_box": about.get("vacuum"),
+    }
+    return {name: metadata.json_ready(value) for name, value in found.items() if value is not None}
+
+
+def _run_toml(settings: RunSettings, resolved: dict[str, Any]) -> str:
+    """Return all settings as TOML; what is unset stands in comments, with the value that the data gave."""
+    lines = [to_toml(settings), "# Unset:"]
+    for group in dataclasses.fields(settings):
+        values = getattr(settings, group.name)
+        for item in dataclasses.fields(values):
+            if getattr(values, item.name) is None:
+                name = f"{group.name}.{item.name}"
+                value = f" = {resolved[name]}" if name in resolved else ""
+                lines.append(f"# {name}{value}  ({item.metadata['description']})")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,1 @@
+"""Jobs as processes, one cluster for all."""

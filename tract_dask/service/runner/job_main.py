@@ -1,0 +1,48 @@
+"""The process that does a job: it takes an order, and ends when it is told to.
+
+The first line of standard input is the order. Then ``cancel`` ends the work in order; the end of standard input, which
+means that the service is gone, ends it at once, with all that it has started. It listens before it imports anything
+that takes time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from queue import SimpleQueue
+from typing import Any
+
+from ...cluster.forkserver import uncollected
+
+
+def main() -> int:
+    """Do the order on standard input; return the exit code."""
+    stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what libraries print is no record
+    orders: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    threading.Thread(target=_listen, args=(threading.get_ident(), orders), daemon=True).start()
+    try:
+        with uncollected():
+            from .job_work import carry_out
+        return carry_out(orders.get(), stream)
+    except KeyboardInterrupt:  # before the work had begun
+        return 130
+
+
+def _listen(main_thread: int, orders: SimpleQueue[dict[str, Any]]) -> None:
+    """Pass the order on, interrupt the work on request, and end everything where nobody is left to listen."""
+    for line in sys.stdin:
+        if line.strip() == "cancel":
+            signal.pthread_kill(main_thread, signal.SIGINT)
+        else:
+            orders.put(json.loads(line))
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    os._exit(main())

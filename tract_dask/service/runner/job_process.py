@@ -1,0 +1,326 @@
+"""One try of a job: the order for its process, what the process says, and what that makes of the job."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from queue import Empty, Queue
+from threading import Event, Thread
+from time import monotonic
+from typing import IO, Any
+
+from ...errors import ClusterError, TractError
+from ...readers.listing import FileList
+from ...settings.cluster import ClusterSettings
+from ...settings.toml import to_dict
+from ..checks import inside, job_settings
+from ..crashes import crash_of, crashed
+from ..data_root import DataRoot
+from ..jobs.records import Job, utc_now
+from ..jobs.states import State
+from ..jobs.store import JobStore
+from ..outputs import Mark, check_owner, seal
+from .cluster_process import Keeper
+
+_log = logging.getLogger(__name__)
+
+COMMAND = (sys.executable, "-m", f"{__package__}.work")
+"""Starts a job's process."""
+
+GRACE_S = 20.0
+"""A process that is told to end is killed after so long."""
+
+CLUSTER_S = 120.0
+"""For so long a try waits for the cluster."""
+
+MOST_LOST_TRIES = 10
+"""After so many tries in a row whose cluster was lost before a shard was finished, the job has failed at the next."""
+
+SHORTEST_BACKOFF_S, LONGEST_BACKOFF_S = 1.0, 300.0
+"""The time before the first try again, which doubles with each more, and the longest: a quarter of an hour in all."""
+
+_LOOK_S = 0.25
+_WORKERS_S = 2.0
+_LAST_LINES = 20
+
+_ENDS = {
+    "done": State.DONE,
+    "done_with_bad_frames": State.DONE_WITH_FAILED_FRAMES,
+    "stopped": State.WAITING,
+}
+
+
+@dataclass
+class Said:
+    """What a try's process has said so far."""
+
+    shards: int = 0
+    outcome: dict[str, Any] | None = None
+    error: str = ""
+    lost: bool = False
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What becomes of a job after a try."""
+
+    state: State
+    reason: str
+    fields: dict[str, Any] = field(default_factory=dict)
+
+
+def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stopping: bool) -> Ending:
+    """Return what becomes of a job whose process has ended; a pure function but for the time of the next try.
+
+    Parameters
+    ----------
+    code
+        The exit code; negative for the signal that killed it. One of a crash ends the job: it would crash again.
+    cancel_reason
+        Why somebody cancelled it; None where nobody did.
+    stopping
+        Whether the service is about to end.
+    """
+    if said.outcome is not None and (cancel_reason is None or said.outcome["state"] != "stopped"):
+        state = _ENDS[said.outcome["state"]]
+        fields = {} if state == State.WAITING else {"outcome": said.outcome}
+        reason = "the columns can be looked at" if state == State.WAITING else ""
+        return Ending(state, reason, fields | {"lost_tries": 0})
+    if cancel_reason is not None:
+        return Ending(State.CANCELLED, cancel_reason)
+    if stopping:
+        return Ending(State.QUEUED, "the service was stopped")
+    if said.error and not said.lost:
+        return Ending(State.FAILED, said.error)
+    if not said.error and (sign := crash_of(code)):
+        return Ending(State.FAILED, str(crashed(job.source, sign)))
+    return after_loss(job, said.error or f"the job's process {_death(code)}", progressed=said.shards > 0)
+
+
+def after_loss(job: Job, reason: str, *, progressed: bool) -> Ending:
+    """Return what becomes of a job whose cluster or process was lost: it is tried again, not too soon nor too often."""
+    lost = 1 if progressed else job.lost_tries + 1
+    if lost > MOST_LOST_TRIES:
+        return Ending(State.FAILED, f"{reason.rstrip('.')}; it was lost {lost} times without getting any further")
+    backoff = min(SHORTEST_BACKOFF_S * 2 ** (lost - 1), LONGEST_BACKOFF_S)
+    return Ending(State.QUEUED, reason, {"lost_tries": lost, "not_before": utc_now(later_s=backoff)})
+
+
+class Attempt(Thread):
+    """A thread that sees a job through one try, from RUNNING to whatever comes then.
+
+    Parameters
+    ----------
+    job
+        As it is after the change to RUNNING.
+    stopping
+        Set where the service is about to end.
+    done
+        Called at the end.
+    """
+
+    def __init__(
+        self, job: Job, store: JobStore, root: DataRoot, keeper: Keeper, stopping: Event, done: Callable[[], object]
+    ) -> None:
+        super().__init__(name=f"job {job.id}", daemon=True)
+        self._job, self._store, self._root, self._keeper = job, store, root, keeper
+        self._stopping, self._done = stopping, done
+        self._mark, self._said = Mark(job.owner, job.id, job.output), Said()
+        self._asked_at: float | None = None
+
+    def run(self) -> None:
+        """See the job through."""
+        try:
+            end = self._try()
+        except (ClusterError, sqlite3.Error) as error:  # the store's disk may be full, or slow
+            end = self._lost(str(error))
+        except TractError as error:
+            end = Ending(State.FAILED, str(error))
+        except Exception as error:  # noqa: BLE001  the last resort: no job may stay behind as running
+            _log.exception("job %s", self._job.id)
+            end = Ending(State.FAILED, f"unexpected {type(error).__name__}: {error}")
+        end = replace(end, reason=self._root.shown(end.reason))
+        if end.reason and end.state in (State.QUEUED, State.FAILED):
+            self._store.log(self._job.id, "error" if end.state == State.FAILED else "warning", end.reason)
+        self._store.change(self._job.id, end.state, end.reason, **end.fields)
+        self._store.close()
+        self._done()
+
+    def _try(self) -> Ending:
+        """Run the process, and follow it to its end."""
+        order = self._order()
+        process = subprocess.Popen(
+            COMMAND,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+            start_new_session=True,  # so that it can be killed with all that it started
+        )
+        with process:
+            try:
+                cluster = self._cluster()  # while the process imports what it needs
+                if cluster is None:
+                    return self._ending(0)
+                where = {"cluster": to_dict(cluster), "credentials": self._keeper.credentials}
+                _tell(process, json.dumps(order | where))
+                last_lines = self._follow(process)
+                with suppress(subprocess.TimeoutExpired):  # it has said its last, and does not end
+                    process.wait(GRACE_S)
+            finally:
+                code = _kill(process)
+                seal(self._root, self._mark)
+        if code and self._said.outcome is None and not self._is_ending():
+            for line in last_lines:
+                self._store.log(self._job.id, "error", self._root.shown(line))
+        return self._ending(code)
+
+    def _order(self) -> dict[str, Any]:
+        """Return the order for the process, but for the cluster; its paths are checked once more.
+
+        A movie that is not there is the run's to judge: it may be converted already.
+        """
+        job, place = self._job, self._root.source(self._job.source, must_exist=False)
+        check_owner(self._root, self._mark)
+        version = job.columns_version
+        columns = None if version is None else self._store.columns(job.id, version) if version else ""
+        return {
+            "job": job.id,
+            "source": str(place),
+            "files": list(map(str, place.files)) if isinstance(place, FileList) else None,
+            "output": str(self._root.path / job.output),
+            "root": str(self._root.path),
+            "closed": list(map(str, self._root.permit.closed)),
+            "mark": asdict(self._mark),
+            "settings": to_dict(inside(self._root, job_settings(job.settings))),
+            "columns": columns,
+            "until": "columns" if job.curate and version is None else None,
+            "stages": job.progress.get("stages", {}),
+        }
+
+    def _cluster(self) -> ClusterSettings | None:
+        """Return the running cluster; None where the try is to end meanwhile.
+
+        Raises
+        ------
+        ClusterError
+            Where it does not come up in time.
+        """
+        deadline = monotonic() + CLUSTER_S
+        while not self._is_ending():
+            try:
+                return self._keeper.ready(timeout_s=1.0)
+            except ClusterError:
+                if monotonic() > deadline:
+                    raise
+                self._stopping.wait(_LOOK_S)
+        return None
+
+    def _follow(self, process: subprocess.Popen[str]) -> deque[str]:
+        """Take what the process says until it says no more; tell it to end where that is wanted.
+
+        Returns
+        -------
+        deque of str
+            The last lines of its standard error.
+        """
+        lines: Queue[str | None] = Queue()
+        last_lines: deque[str] = deque(maxlen=_LAST_LINES)
+        Thread(target=_read, args=(_open(process.stdout), lines), daemon=True).start()
+        errors = Thread(target=last_lines.extend, args=(map(str.rstrip, _open(process.stderr)),), daemon=True)
+        errors.start()
+        looked = 0.0
+        while True:
+            try:
+                line = lines.get(timeout=_LOOK_S)
+                if line is None:
+                    errors.join(1.0)
+                    return last_lines
+                self._take(json.loads(line))
+            except (Empty, ValueError):  # the last line of a process that is killed may be torn
+                pass
+            if self._asked_at is None and self._is_ending():
+                self._asked_at = monotonic()
+                _tell(process, "cancel")
+            if self._asked_at is not None and monotonic() - self._asked_at > GRACE_S:
+                _kill(process)
+            if monotonic() - looked > _WORKERS_S:
+                looked = monotonic()
+                seen = {"workers": self._keeper.workers(), "dashboard": self._keeper.dashboard() is not None}
+                self._store.workers(self._job.id, seen)
+
+    def _take(self, record: dict[str, Any]) -> None:
+        """Note what the process says; paths of the data root end here."""
+        record, job_id = self._root.shown(record), self._job.id
+        match record["kind"]:
+            case "stage":
+                self._store.stage(job_id, record["stage"])
+            case "progress":
+                self._said.shards = record["shards"]
+                self._store.progress(job_id, record["data"])
+            case "log":
+                self._store.log(job_id, record["level"], record["message"])
+            case "outcome":
+                self._said.outcome = {name: value for name, value in record.items() if name != "kind"}
+            case "error":
+                self._said.error, self._said.lost = record["text"], record["lost"]
+
+    def _is_ending(self) -> bool:
+        return self._stopping.is_set() or self._store.cancel_requested(self._job.id)
+
+    def _lost(self, why: str) -> Ending:
+        self._said.error, self._said.lost = why, True
+        return self._ending(1)
+
+    def _ending(self, code: int) -> Ending:
+        reason = self._store.cancel_reason(self._job.id)
+        return ending(self._job, self._said, code, cancel_reason=reason, stopping=self._stopping.is_set())
+
+
+def _read(stream: IO[str], lines: Queue[str | None]) -> None:
+    """Put the lines of a stream into a queue, then None."""
+    for line in stream:
+        lines.put(line)
+    lines.put(None)
+
+
+def _open(stream: IO[str] | None) -> IO[str]:
+    assert stream is not None, "it was asked for"
+    return stream
+
+
+def _tell(process: subprocess.Popen[str], line: str) -> None:
+    """Write a line to a process, which may have died already: its exit code tells."""
+    with suppress(OSError):
+        _open(process.stdin).write(f"{line}\n")
+        _open(process.stdin).flush()
+
+
+def _kill(process: subprocess.Popen[str]) -> int:
+    """Kill a process with all that it started, whether it still runs or not; return its exit code."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    with suppress(OSError):  # what it has not read is still to be written
+        _open(process.stdin).close()
+    return process.wait()
+
+
+def _death(code: int) -> str:
+    """Say how a process ended that gave no reason.
+
+    Examples
+    --------
+    >>> _death(-9), _death(1)
+    ('was killed (SIGKILL)', 'ended with exit code 1')
+    """
+    return f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with exit code {code}"

@@ -1,0 +1,119 @@
+"""Runs the jobs: takes them from the queue, so many at a time, and sees each through its tries."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+from contextlib import ExitStack
+from threading import Event, Thread
+
+from ...store.locks import sole_use
+from ..config import ServiceConfig
+from ..deletion import finish_deletions
+from ..jobs.records import Job, utc_now
+from ..jobs.states import State
+from ..jobs.store import JobStore
+from .cluster_process import Keeper
+from .fair_queue import next_job
+from .job_process import Attempt
+
+_log = logging.getLogger(__name__)
+
+_LOOK_S = 1.0
+
+
+class Runner:
+    """Runs the jobs of a store on the cluster that they share.
+
+    Parameters
+    ----------
+    config
+        Says where the data are, how many jobs run at a time, and on which cluster.
+    store
+        Of the jobs; of all runners, only this one may run them.
+
+    Attributes
+    ----------
+    keeper
+        Keeps the cluster.
+    """
+
+    def __init__(self, config: ServiceConfig, store: JobStore) -> None:
+        self.keeper = Keeper(config.cluster, config.state)
+        self._config, self._store, self._root = config, store, config.root
+        self._attempts: dict[str, Attempt] = {}
+        self._awake, self._stopping = Event(), Event()
+        self._thread: Thread | None = None
+        self._held = ExitStack()
+
+    def start(self) -> None:
+        """Take up the jobs where a service before has left them, and go on.
+
+        Raises
+        ------
+        DestinationError
+            Where another service works on the same data root.
+        """
+        lock = self._config.state / "service.lock"
+        self._held.enter_context(sole_use(lock, "another service works on this data root", patience_s=5.0))
+        self._stopping.clear()
+        self._recover("the service had been killed")
+        Thread(target=finish_deletions, args=(self._root, self._store), name="tidying", daemon=True).start()
+        self.keeper.start()
+        self._thread = Thread(target=self._loop, name="runner", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the running jobs' processes; the jobs go back to the queue."""
+        self._stopping.set()
+        self._awake.set()
+        if self._thread is not None:
+            self._thread.join()
+        for attempt in self._attempts.values():
+            attempt.join()
+        self.keeper.stop()
+        self._held.close()
+
+    def is_alive(self) -> bool:
+        """Tell whether jobs are started."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def wake(self) -> None:
+        """Look at the queue now: something has changed."""
+        self._awake.set()
+
+    def _loop(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._fill()
+            except sqlite3.Error:  # a full disk, say: the next look may go well
+                _log.exception("the job store cannot be used")
+            self._awake.wait(_LOOK_S)
+            self._awake.clear()
+
+    def _fill(self) -> None:
+        """Start as many jobs as there is room for."""
+        self._attempts = {name: attempt for name, attempt in self._attempts.items() if attempt.is_alive()}
+        self._recover("its thread had ended")
+        while len(self._attempts) < self._config.concurrency and not self._stopping.is_set():
+            job = next_job(self._store.queued(), self._store.running(), self._store.served(), utc_now())
+            if job is None:
+                return
+            self._start(job)
+
+    def _start(self, job: Job) -> None:
+        job = self._store.change(job.id, State.RUNNING, "its turn")
+        attempt = Attempt(job, self._store, self._root, self.keeper, self._stopping, self.wake)
+        self._attempts[job.id] = attempt
+        attempt.start()
+
+    def _recover(self, reason: str) -> None:
+        """Put jobs back into the queue that are noted as running, but that nobody runs."""
+        for job in self._store.running():
+            if job.id in self._attempts:
+                continue
+            cancelled = self._store.cancel_reason(job.id)
+            if cancelled is None:
+                self._store.change(job.id, State.QUEUED, reason)
+            else:
+                self._store.change(job.id, State.CANCELLED, cancelled)

@@ -1,0 +1,346 @@
+"""The tracks of a job, as its pages show them: numbers of columns and frames, series, displacements; as JSON.
+
+Called in the workshop. All work on a store whose fits still run: then of its finished shards. Lengths are in pm, or in
+px where the size of a pixel is not known; what is not known is null.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from ...analysis import motion
+from ...errors import InputError, SettingsError
+from ...kernels.gaussian import parameters
+from ...settings.run import FitSettings
+from ...settings.toml import from_toml, load, to_dict
+from ...store import datasets, metadata, results, schema
+from .pictures import as_json
+from .track_cache import QUANTITIES, open_tracks
+
+Floats = NDArray[np.float64]
+
+_DIGITS = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """What the numbers of a store mean."""
+
+    pixel_size_pm: float | None
+    frame_time_s: float | None
+    dose: float | None
+
+    @property
+    def scale(self) -> float:
+        """Lengths in :attr:`unit` for one px."""
+        return self.pixel_size_pm or 1.0
+
+    @property
+    def unit(self) -> str:
+        """Of lengths."""
+        return "pm" if self.pixel_size_pm else "px"
+
+    @property
+    def time_unit(self) -> str:
+        """Of times: frames where the time of one is not known."""
+        return "s" if self.frame_time_s else "frames"
+
+    def times(self, frames: Floats) -> Floats:
+        """Return the times of frames."""
+        return frames * (self.frame_time_s or 1.0)
+
+
+def summary(folder: Path, cache: Path, version: str) -> bytes:
+    """Return how much is done, what was measured, and how."""
+    path = folder / "results.zarr"
+    tracks, known, about = open_tracks(path, cache), _calibration(path), metadata.attributes(path)
+    sizes = len(tracks.done), len(tracks.columns["fits"])
+    return as_json(
+        {
+            "version": version,
+            "complete": bool(about.get("complete")),
+            "shards": {"done": int(tracks.shards.sum()), "total": len(tracks.shards)},
+            "frames": {"done": int(tracks.done.sum()), "total": sizes[0]},
+            "columns": sizes[1],
+            "fits": int(tracks.columns["fits"].sum()),
+            "accepted": int(tracks.columns["accepted"].sum()),
+            **dataclasses.asdict(known),
+            "unit": known.unit,
+            "time_unit": known.time_unit,
+            "window_px": about.get("window"),
+            "source": Path(str(about.get("source", ""))).name,
+            "created": about.get("created"),
+            "versions": about.get("versions", {}),
+            "settings": _settings(folder, about),
+            "bytes": {
+                "zarr": results.stored_bytes(path),
+                "nc": _dataset_bytes(*sizes),
+                "csv": 470 * int(tracks.done.sum()) * sizes[1],
+            },
+        }
+    )
+
+
+def columns(folder: Path, cache: Path, version: str) -> bytes:
+    """Return the numbers of every column."""
+    path = folder / "results.zarr"
+    tracks, known, static = open_tracks(path, cache), _calibration(path), _static(path)
+    of = tracks.columns
+    count = of["accepted"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sd_x, sd_y = (
+            known.scale * np.sqrt(np.where(count > 1, of[name], np.nan) / (count - 1)) for name in ("xx", "yy")
+        )
+        numbers = {
+            "sd": np.sqrt((sd_x**2 + sd_y**2) / 2),
+            "sd_x": sd_x,
+            "sd_y": sd_y,
+            "stated": known.scale * np.sqrt(np.where(count > 0, of["variance"], np.nan) / (2 * count)),
+            "accepted_share": count / np.where(of["fits"] > 0, of["fits"], np.nan),
+            "intensity": np.where(count > 0, of["intensity"], np.nan),
+        }
+    table = {
+        "column_id": static["column_id"].to_numpy().tolist(),
+        "x": numbers_of(static["x_ref"].to_numpy()),
+        "y": numbers_of(static["y_ref"].to_numpy()),
+        "kind": [str(kind) for kind in static["kind"].to_numpy()],
+        "fits": of["fits"].astype(int).tolist(),
+        "accepted": count.astype(int).tolist(),
+        **{name: numbers_of(values) for name, values in numbers.items()},
+    }
+    rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    return as_json({"version": version, "unit": known.unit, "columns": rows})
+
+
+def series(
+    folder: Path, cache: Path, column_id: int, frames: tuple[int, int | None], points: int, version: str
+) -> bytes:
+    """Return one column in time: place and intensity of its accepted fits, averaged where there are more than points.
+
+    Parameters
+    ----------
+    frames
+        The first, and the one after the last; None: all from the first.
+    points
+        Most of them; longer series are averaged over equal numbers of frames.
+
+    Raises
+    ------
+    InputError
+        Where there is no such column or frame.
+    """
+    path = folder / "results.zarr"
+    tracks, known, static = open_tracks(path, cache), _calibration(path), _static(path)
+    ids = static["column_id"].to_numpy().tolist()
+    if column_id not in ids:
+        raise InputError("there is no such column", "column_id", f"one of {len(ids)} columns", f"{column_id}")
+    place = ids.index(column_id)
+    start, stop = _range(frames, len(tracks.done))
+    own = tracks.series(place, start, stop)
+    step = -(-(stop - start) // points)
+    reference = {axis: float(static[f"{axis}_ref"].to_numpy()[place]) for axis in ("x", "y")}
+    found: dict[str, Any] = {
+        "version": version,
+        "column_id": column_id,
+        "kind": str(static["kind"].to_numpy()[place]),
+        "x_ref": reference["x"],
+        "y_ref": reference["y"],
+        "unit": known.unit,
+        "time_unit": known.time_unit,
+        "frames_per_point": step,
+        "frame": list(range(start, stop, step)),
+        "t": numbers_of(known.times(_middles(start, stop, step))),
+        "accepted": _groups(np.isfinite(own["x"]), step, False).sum(axis=1).astype(int).tolist(),
+    }
+    for name in QUANTITIES:
+        values, error = own[name], own[f"{name}_stderr"]
+        found |= _binned(name, values, error, step)
+        if name in reference:
+            away = known.scale * (values - reference[name])
+            found |= _binned(f"d{name}", away, known.scale * error, step)
+    return as_json(found)
+
+
+def frames(folder: Path, cache: Path, points: int, version: str) -> bytes:
+    """Return drift, share of accepted fits and mean amplitude over the frames, averaged where they are many."""
+    path = folder / "results.zarr"
+    tracks, known = open_tracks(path, cache), _calibration(path)
+    n_frames, of = len(tracks.done), tracks.frames
+    step = -(-n_frames // points)
+    fits, accepted = (_groups(np.nan_to_num(of[name]), step, 0.0).sum(axis=1) for name in ("fits", "accepted"))
+    means = {name: _mean(of[name], step) for name in ("drift_x", "drift_y", "amplitude")}
+    return as_json(
+        {
+            "version": version,
+            "time_unit": known.time_unit,
+            "pixel_size_pm": known.pixel_size_pm,
+            "frames_per_point": step,
+            "frame": list(range(0, n_frames, step)),
+            "t": numbers_of(known.times(_middles(0, n_frames, step))),
+            "accepted_share": numbers_of(accepted / np.where(fits > 0, fits, np.nan)),
+            **{name: numbers_of(values) for name, values in means.items()},
+        }
+    )
+
+
+def displacement(folder: Path, first: int, second: int, version: str) -> bytes:
+    """Return how far each column moved from one frame to another; see :func:`tract_dask.analysis.motion.displacement`.
+
+    Raises
+    ------
+    InputError
+        Where there is no such frame.
+    """
+    path = folder / "results.zarr"
+    tracks, known = _only(path, (first, second)), _calibration(path)
+    moved = motion.displacement(tracks, first, second)
+    values = {
+        f"{name}_{axis}": moved[variable].sel(axis=axis).to_numpy()
+        for name, variable in (("d", "displacement"), ("stderr", "stderr"))
+        for axis in ("x", "y")
+    }
+    values |= {name: moved[name].to_numpy() for name in ("distance", "p_value")}
+    table = {
+        "column_id": tracks["column_id"].to_numpy().tolist(),
+        "x": numbers_of(tracks["x_ref"].to_numpy()),
+        "y": numbers_of(tracks["y_ref"].to_numpy()),
+        **{name.replace("d_", "d"): numbers_of(of) for name, of in values.items()},
+    }
+    rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    told = {"version": version, "first": first, "second": second, "unit": known.unit, "columns": rows}
+    return as_json(told)
+
+
+def _only(path: Path, frames: tuple[int, ...]) -> xr.Dataset:
+    """Return the fits of a few frames, in memory; those of frames that are not done are not accepted.
+
+    Raises
+    ------
+    InputError
+        Where there is no such frame.
+    """
+    finished = results.finished_shards(path)
+    opened = results.variables(path)
+    arrays = {name: opened(name) for name in (*results.FITTED, "status")}
+    n_frames, step = arrays["fit"].shape[0], arrays["fit"].chunks[0]
+    wanted = sorted(set(frames))
+    outside = [frame for frame in wanted if not 0 <= frame < n_frames]
+    if outside:
+        raise InputError("there is no such frame", "frame", f"0 to {n_frames - 1}", f"{outside[0]}")
+    coordinates = {"frame": wanted, "parameter": list(parameters.PARAMETERS)}
+    tracks = _static(path).assign_coords(coordinates).assign_attrs(pixel_size_pm=_calibration(path).scale)
+    for name, array in arrays.items():
+        values = np.stack([np.asarray(array[frame]) for frame in wanted])
+        tracks[name] = (schema.RESULTS[name].dims, values)
+    done = xr.DataArray(finished[np.array(wanted) // step], dims="frame")
+    return tracks.assign(status=tracks["status"].where(done, np.uint8(schema.Status.NOT_CONVERGED)))
+
+
+def open_finished(path: Path) -> xr.Dataset:
+    """Return the tracks of the frames that are done, lazily."""
+    tracks = results.open_results(path, unfinished=True)
+    step = datasets.open_array(path / "fit").chunks[0]
+    done = np.repeat(results.finished_shards(path), step)[: tracks.sizes["frame"]]
+    return tracks if done.all() else tracks.isel(frame=np.flatnonzero(done))
+
+
+def numbers_of(values: Floats) -> list[float | None]:
+    """Return numbers for JSON: None for what is not finite.
+
+    Examples
+    --------
+    >>> numbers_of(np.array([1.5, np.nan, 0.1 + 0.2]))
+    [1.5, None, 0.3]
+    """
+    rounded = np.round(values.astype(np.float64), _DIGITS)
+    return [value if known else None for value, known in zip(rounded.tolist(), np.isfinite(rounded), strict=True)]
+
+
+def _calibration(path: Path) -> Calibration:
+    about = metadata.attributes(path)
+    return Calibration(about.get("pixel_size_pm"), about.get("frame_time_s"), about.get("dose"))
+
+
+def _static(path: Path) -> xr.Dataset:
+    """Return the columns of a store: ``x_ref``, ``y_ref`` and ``kind``."""
+    return _columns_of(path, str(metadata.attributes(path).get("key")))
+
+
+@lru_cache(maxsize=16)
+def _columns_of(path: Path, key: str) -> xr.Dataset:
+    return datasets.open_dataset(path, only=("x_ref", "y_ref", "kind"))
+
+
+def _range(frames: tuple[int, int | None], n_frames: int) -> tuple[int, int]:
+    start, stop = frames[0], n_frames if frames[1] is None else min(frames[1], n_frames)
+    if not 0 <= start < stop:
+        raise InputError(
+            "these are no frames", "start, stop", f"0 <= start < stop <= {n_frames}", f"{start}, {frames[1]}"
+        )
+    return start, stop
+
+
+def _groups(values: NDArray[Any], step: int, fill: Any) -> NDArray[Any]:
+    """Return groups of ``step`` consecutive values, (groups, step); the last is filled up."""
+    missing = -len(values) % step
+    return np.concatenate([values, np.full(missing, fill, values.dtype)]).reshape(-1, step)
+
+
+def _middles(start: int, stop: int, step: int) -> Floats:
+    first = np.arange(start, stop, step)
+    return (first + np.minimum(first + step, stop) - 1) / 2
+
+
+def _mean(values: Floats, step: int) -> Floats:
+    """Return the means of groups of values; NaN where a group has none."""
+    groups = _groups(values, step, np.nan)
+    known = np.isfinite(groups)
+    count = known.sum(axis=1)
+    means: Floats = np.where(known, groups, 0).sum(axis=1) / np.where(count > 0, count, np.nan)
+    return means
+
+
+def _binned(name: str, values: Floats, error: Floats, step: int) -> dict[str, Any]:
+    """Return means over groups of frames and their standard errors; of groups of more than one also the extremes.
+
+    The error of a mean is that which the errors of its values make, sqrt(sum of squares) / number; where these are not
+    known, it comes from the spread of the values.
+    """
+    groups, errors = _groups(values, step, np.nan), _groups(error, step, np.nan)
+    known = np.isfinite(groups)
+    count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+    mean = np.where(known, groups, 0).sum(axis=1) / count
+    stated = np.sqrt((np.where(known, errors, 0) ** 2).sum(axis=1)) / count
+    squares = np.where(known, (groups - mean[:, None]) ** 2, 0).sum(axis=1)
+    seen = np.sqrt(squares / np.where(count > 1, count - 1, np.nan) / count)
+    told = {name: mean, f"{name}_stderr": np.where(np.isfinite(stated), stated, seen)}
+    if step > 1:
+        told |= {
+            f"{name}_low": np.where(known, groups, np.inf).min(axis=1),
+            f"{name}_high": np.where(known, groups, -np.inf).max(axis=1),
+        }
+    return {key: numbers_of(of) for key, of in told.items()}
+
+
+def _settings(folder: Path, about: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of the run by group; those of the fit alone where the run's cannot be read."""
+    try:
+        return to_dict(load(folder / "run.toml"))
+    except SettingsError:
+        return {"fit": to_dict(from_toml(FitSettings, about["settings"]))}
+
+
+def _dataset_bytes(n_frames: int, n_columns: int) -> int:
+    """Return the bytes of all variables of the results, uncompressed."""
+    sizes = {"frame": n_frames, "column_id": n_columns} | schema.SIZES
+    return sum(
+        np.dtype(variable.dtype).itemsize * int(np.prod([sizes[dim] for dim in variable.dims]))
+        for variable in schema.RESULTS.values()
+    )

@@ -1,0 +1,1 @@
+"""All settings: declared once, read and written as TOML."""

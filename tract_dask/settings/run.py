@@ -1,0 +1,259 @@
+"""Every setting of every stage: frozen dataclasses that check themselves, and their TOML form.
+
+A setting is declared once, here, with its default, unit, range and one sentence; the command line, the documentation
+and the checks come from that declaration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..errors import SettingsError
+from .cluster import ClusterSettings
+from .declare import Settings, setting
+
+
+@dataclass(frozen=True)
+class SourceSettings(Settings):
+    """How to read a file that does not say enough about itself."""
+
+    raw_shape: tuple[int, ...] | None = setting(
+        None,
+        "Frames, rows and columns of a raw binary file; frames 0 means as many as the file holds",
+        unit="px",
+    )
+    raw_dtype: str | None = setting(None, "Pixel type of a raw binary file, such as uint16 or >f4")
+    raw_offset: int = setting(0, "Bytes to skip at the start of a raw binary file", unit="bytes", low=0)
+
+
+@dataclass(frozen=True)
+class MetadataSettings(Settings):
+    """What the user knows better than the file; unset means as the file says."""
+
+    pixel_size_pm: float | None = setting(None, "Size of a pixel", unit="pm", low=1e-3, high=1e7)
+    frame_time_s: float | None = setting(None, "Time from one frame to the next", unit="s", low=1e-12, high=1e6)
+    dose: float | None = setting(None, "Electron dose of one frame", unit="e/A^2", low=0)
+    gain: float = setting(1.0, "Electron counts for one detector unit", unit="counts", low=1e-12, high=1e12)
+
+
+@dataclass(frozen=True)
+class ConvertSettings(Settings):
+    """The layout of movie.zarr."""
+
+    shard_mb: float = setting(
+        256.0, "Uncompressed size of a shard, the unit of writing and of work", unit="MB", low=1, high=4096
+    )
+    tile_px: int = setting(256, "Side of the tiles inside a shard", unit="px", low=16, high=8192)
+    codec: str = setting("lz4", "Lossless compression: lz4 is fast, zstd is smaller", choices=("lz4", "zstd", "none"))
+
+
+@dataclass(frozen=True)
+class DriftSettings(Settings):
+    """How the movement of the whole field is measured."""
+
+    method: str = setting(
+        "auto",
+        "Measure the drift, read it from a CSV file, or take it as zero",
+        choices=("auto", "csv", "none"),
+        flag="--drift",
+    )
+    csv: str | None = setting(
+        None, "CSV file with columns frame, y, x (drift in px), for method csv", flag="--drift-csv"
+    )
+    search_px: float | None = setting(
+        None,
+        "Largest step between two frames; unset: 0.4 of the shortest lattice period",
+        unit="px",
+        low=0.5,
+        flag="--drift-search-px",
+    )
+    refine: bool = setting(
+        True,
+        "Correct the drift of each frame by the common motion of its fitted columns",
+        flag="--drift-refine",
+    )
+    refine_columns: int = setting(10, "Fewest accepted columns of a frame for that correction", low=3)
+
+
+@dataclass(frozen=True)
+class ColumnSettings(Settings):
+    """How the atomic columns are found in the summed image."""
+
+    method: str = setting(
+        "auto",
+        "Find columns automatically, on lattices, at the positions of a CSV file, or by what stands out of the noise",
+        choices=("auto", "lattice", "csv", "maxima", "blobs", "template"),
+        flag="--columns-method",
+    )
+    csv: str | None = setting(None, "CSV file with columns x, y and optionally column_id, kind", flag="--columns")
+    contrast: str = setting(
+        "bright", "Columns are brighter or darker than their surroundings", choices=("bright", "dark")
+    )
+    lattices: tuple[Any, ...] = setting(
+        (),
+        "Lattices for method lattice: origin, a, a_count, b, b_count (positions in px), a_repeats, b_repeats, kind",
+    )
+    spacing_px: float | None = setting(None, "Distance between neighbouring columns; unset: measured", unit="px", low=2)
+    search_radius_px: float | None = setting(
+        None, "Radius of the local maximum around a seed; unset: a quarter of the spacing", unit="px", low=0
+    )
+    centroid_radius_px: float | None = setting(
+        None, "Radius of the centroid around that maximum; unset: an eighth of the spacing", unit="px", low=1
+    )
+    min_amplitude: float = setting(
+        0.15,
+        "Weakest column that is kept, against the median amplitude",
+        low=0,
+        high=1,
+        flag="--min-amplitude",
+    )
+    detection_threshold: float = setting(
+        5.0, "Methods maxima, blobs, template: weakest column, in units of what noise alone shows", low=0, high=1e4
+    )
+    template: tuple[int, ...] | None = setting(
+        None,
+        "Method template: x, y of the column that the others look like; unset: the mean of the strongest",
+        unit="px",
+        flag="--template-at",
+    )
+
+
+@dataclass(frozen=True)
+class FitSettings(Settings):
+    """How a column is fitted in every frame."""
+
+    window_px: int | None = setting(
+        None, "Diameter of the round window that is fitted, odd; unset: half the spacing", unit="px", low=5, high=501
+    )
+    estimator: str = setting(
+        "lsq",
+        "Least squares on blurred pixels, or maximum likelihood on raw counts (poisson), best where contrast is high",
+        choices=("lsq", "poisson"),
+    )
+    shape: str = setting(
+        "fixed",
+        "Sigmas and theta of a column stay as in the summed image, or are fitted in every frame (free, the paper's)",
+        choices=("fixed", "free"),
+    )
+    filter: str = setting(
+        "gaussian",
+        "What frames go through before lsq fits: a Gaussian blur, a filter of the whole frame, or nothing",
+        choices=("gaussian", "wiener", "tv-l1", "none"),
+    )
+    blur_sigma_px: float = setting(
+        2.0,
+        "Gaussian blur (the paper's 2 px) before columns, noise and lsq fits are looked at; 0 leaves pixels raw",
+        unit="px",
+        low=0,
+        high=20,
+    )
+    wiener_background: float = setting(
+        1.0,
+        "Filter wiener: times that the radial background of the power spectrum is subtracted",
+        low=0,
+        high=100,
+    )
+    wiener_cutoff: float = setting(
+        0.3,
+        "Filter wiener: frequency at which its low pass halves the power, in units of half a cycle a pixel",
+        low=0.01,
+        high=100,
+    )
+    tv_fidelity: float = setting(
+        0.9,
+        "Filter tv-l1: weight of fidelity; a disc is removed where its radius is below 2 over this",
+        unit="1/px",
+        low=1e-3,
+        high=100,
+    )
+    tv_iterations: int = setting(200, "Filter tv-l1: most iterations", low=1, high=100000)
+    mask_radius_px: float | None = setting(
+        None,
+        "Radius of the centroid's mask; unset: 1.894 of the column's sigma, with which its noise is least",
+        unit="px",
+        low=1.5,
+    )
+    max_shift_px: float | None = setting(
+        None,
+        "Farthest a column may be from its place in the summed image; unset: a quarter of the window",
+        unit="px",
+        low=0.1,
+    )
+    sigma_factor: float = setting(
+        1.3, "Free sigmas stay within this factor of those in the summed image", low=1.01, high=100
+    )
+    amplitude_factor: float = setting(
+        5.0, "Amplitude stays below this factor of that in the summed image", low=1.01, high=1e6
+    )
+    threshold: float = setting(
+        1.6, "Accept a fit where the amplitude exceeds this times the noise (the paper's 2)", low=0, high=100
+    )
+    counting: bool = setting(
+        True, "For standard errors: the noise grows with the signal, as counts do; else it is the same in every pixel"
+    )
+    intensity_scale: str = setting(
+        "paper",
+        "Share of a Gaussian inside two sigma: the paper's box (0.9111) or the ellipse (0.8647)",
+        choices=("paper", "ellipse"),
+    )
+    vacuum_box: tuple[int, ...] | None = setting(
+        None,
+        "Empty region for the noise: y0, y1, x0, x1 in the summed image; unset: found automatically",
+        unit="px",
+    )
+    tolerance_px: float = setting(
+        1e-4, "A fit has converged when its position moves less than this", unit="px", low=1e-8, high=0.1
+    )
+    max_iterations: int = setting(50, "Most iterations of one fit", low=1, high=10000)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.estimator == "poisson" and self.filters_frames:
+            raise SettingsError(
+                "filtered frames are not counts",
+                "setting filter (FitSettings)",
+                "gaussian or none, which leave the windows of the estimator poisson raw",
+                repr(self.filter),
+                "Choose the estimator lsq, or another filter",
+            )
+
+    @property
+    def filters_frames(self) -> bool:
+        """Whether the filter needs the whole frame, and makes standard errors unknown."""
+        return self.filter in ("wiener", "tv-l1")
+
+    @property
+    def window_blur_px(self) -> float:
+        """Sigma of the blur that windows go through before they are fitted: none where counts are."""
+        return 0.0 if self.estimator == "poisson" or self.filter != "gaussian" else self.blur_sigma_px
+
+    @property
+    def noise_blur_px(self) -> float:
+        """Sigma of the blur before the noise is measured: none where whole frames are filtered."""
+        return 0.0 if self.filters_frames else self.blur_sigma_px
+
+
+@dataclass(frozen=True)
+class RunSettings(Settings):
+    """All settings of a run."""
+
+    source: SourceSettings = field(default_factory=SourceSettings)
+    metadata: MetadataSettings = field(default_factory=MetadataSettings)
+    convert: ConvertSettings = field(default_factory=ConvertSettings)
+    drift: DriftSettings = field(default_factory=DriftSettings)
+    columns: ColumnSettings = field(default_factory=ColumnSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
+
+
+TITLES = {
+    "source": "Reading",
+    "metadata": "Metadata (otherwise as the file says)",
+    "convert": "Conversion",
+    "drift": "Drift",
+    "columns": "Columns",
+    "fit": "Fit",
+    "cluster": "Cluster (otherwise a local one)",
+}
+"""Headings of the groups, by the name of the group in :class:`RunSettings`."""

@@ -1,0 +1,1 @@
+"""Stage columns: where the atomic columns are in the summed image."""

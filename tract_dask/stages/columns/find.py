@@ -1,0 +1,364 @@
+"""The columns stage: where the atomic columns are in the summed image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ...errors import InputError, SettingsError
+from ...kernels.blur import cut_windows
+from ...kernels.gaussian import parameters
+from ...kernels.gaussian.fit import GaussianFits, fit_gaussians
+from ...kernels.magnitude import unit_of
+from ...kernels.peaks import centroids, climb
+from ...settings.run import ColumnSettings
+from ...store import schema
+from ...store.columns import check_inside, column_dataset, lattice_sites, positions, read_columns_csv, write_columns_csv
+from ...store.schema import Status
+from .detect import METHODS, make_detector
+from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
+from .sites import lattice_columns
+from .window_size import check_window, default_window, neighbour_distance
+
+__all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
+
+Places = NDArray[np.float64]
+AMPLITUDE, X, Y, SIGMA_A, SIGMA_B, THETA, BACKGROUND = range(len(parameters.PARAMETERS))
+
+_SAME = 1 / 3
+"""Seeds nearer than this share of the spacing, after refinement, are one column."""
+_SIGNIFICANT = 3.0
+"""Amplitude, in standard deviations of the blurred image's noise, below which a column is flagged below_noise."""
+_SHAPE_FACTOR = 1.5
+"""A sigma beyond this factor of its median over the columns of the same kind is unusual; the fit is then repeated."""
+_SHAPE_MARGIN = 1.1
+"""With sigmas within this factor of the median."""
+_FEWEST_FOR_SHAPE = 5
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``.
+
+    A pixel is a number of ``unit`` counts.
+    """
+
+    counts: NDArray[np.float64]
+    image: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    sign: int
+    noise: float
+    blur_sigma_px: float
+    unit: float
+
+    def lattice(self, spacing_px: float | None = None) -> Lattice | None:
+        return find_lattice(self.image, self.valid, self.noise, self.blur_sigma_px, spacing_px)
+
+    def relief(self, spacing: float, precision_px: float = np.inf) -> Relief:
+        return relief(self.image, self.valid, self.noise, spacing, self.blur_sigma_px, precision_px)
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Where to look: (n, 2) of (x, y), kinds, numbers to report them by; ``fixed``: the numbers stay as IDs."""
+
+    places: Places
+    kind: NDArray[np.str_]
+    number: NDArray[np.int64]
+    fixed: bool
+
+
+def find_columns(
+    summed: xr.Dataset,
+    settings: ColumnSettings | None = None,
+    *,
+    seeds: xr.Dataset | None = None,
+    blur_sigma_px: float = 2.0,
+    window_px: int | None = None,
+) -> xr.Dataset:
+    """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
+
+    Seeds come from the image (method ``auto``, see :func:`tract_dask.stages.columns.lattice.find_peaks`), from lattices of three atoms
+    (``lattice``, see :func:`lattice_columns`), from a file (``csv``), or are what stands out of the noise (``maxima``,
+    ``blobs``, ``template``, see :mod:`tract_dask.stages.columns.detect`). Each moves to the local maximum within the
+    search radius, then to the centroid around that, and there Equation 1 is fitted.
+
+    Parameters
+    ----------
+    summed
+        From :func:`tract_dask.sum_image`.
+    settings
+        Defaults to automatic columns, bright.
+    seeds
+        Columns to start from, as :func:`lattice_columns` and :func:`read_columns_csv` return them and as you may have
+        changed them; they take the place of the method, and keep their IDs. With a variable ``share``, as
+        :func:`tract_dask.link_detections` leaves it, the amplitude is divided by the share of the frames in which the
+        column is there.
+    blur_sigma_px, window_px
+        As in the fit of the frames, px. The window's default is half the columns' spacing, odd.
+
+    Returns
+    -------
+    xr.Dataset
+        As declared in :data:`schema.COLUMNS`. Columns found automatically or on lattices are numbered from 1, row by
+        row from the top and by x within a row (the columns no more than a third of the spacing below a row's first);
+        those from a file or ``seeds`` keep their order and IDs. A column whose window leaves the exposed part of the
+        image is kept where its seed was, with the flag outside_frame and without a fit. Attributes: spacing_px (median
+        distance to the nearest neighbour), window_px, contrast, blur_sigma_px, pixel_size_pm, n_seeds, and merged:
+        pairs of a column's ID and the number of a later seed that refined to the same column and was dropped. (A seed's
+        number is its ID, or its place in the list of seeds, from 1: automatic ones are listed strongest first, those of
+        lattices lattice by lattice, without the sites beyond the image.)
+
+    Raises
+    ------
+    SettingsError
+        Where lattices, file or window cannot be used, or seeds of a file lie outside the image.
+    InputError
+        Where there is no column.
+    """
+    settings = settings or ColumnSettings()
+    schema.validate(summed, schema.SUM, "summed image")
+    scene = _scene(summed, settings, blur_sigma_px)
+    found, spacing = _seeds(scene, settings, seeds)
+    reason = "" if window_px else f", from a spacing of {spacing:.4g} px"
+    window = check_window(window_px or default_window(spacing), scene.image.shape, reason)
+    search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
+    centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
+    places = _refined(scene.relief(spacing, min(search / 6, centroid / 3)), found.places, search, centroid)
+    inside, corner = _corners(places, window, scene.valid)
+    places = np.where(inside[:, None], places, found.places)
+    fit, status = _fit(scene, places, corner, inside, found.kind, window, max(search, 1.0))
+    fit[:, [AMPLITUDE, BACKGROUND]] *= scene.unit
+    if seeds is not None and "share" in seeds:
+        fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
+    fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
+    places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], places)
+    twins = _twins(places, _SAME * spacing)
+    kept = np.setdiff1d(np.arange(len(places)), list(twins))
+    kept = kept if found.fixed else kept[_reading_order(places[kept], spacing / 3)]
+    ids = found.number[kept] if found.fixed else np.arange(1, len(kept) + 1)
+    columns = column_dataset(places[kept], found.kind[kept].tolist(), ids, fit[kept], status[kept])
+    name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
+    columns.attrs = {
+        "spacing_px": neighbour_distance(places[kept]) or spacing,
+        "window_px": window,
+        "contrast": settings.contrast,
+        "blur_sigma_px": float(blur_sigma_px),
+        "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
+        "n_seeds": len(found.number),
+        "merged": sorted([name[first], int(found.number[twin])] for twin, first in twins.items()),
+    }
+    return columns
+
+
+def _scene(summed: xr.Dataset, settings: ColumnSettings, blur_sigma_px: float) -> _Scene:
+    counts = summed["image"].to_numpy().astype(np.float64, copy=False)
+    valid = np.isfinite(counts) & (summed["exposure"].to_numpy() > 0)
+    if not valid.any():
+        raise InputError(
+            "the summed image is empty", "columns", "exposed pixels", "none", "Check the drift: it may leave no overlap"
+        )
+    if not valid.all():
+        counts = np.where(valid, counts, np.median(sample(counts[valid])))
+    unit = unit_of(counts)
+    counts = counts if unit == 1 else counts / unit
+    image, sign = (counts, 1) if settings.contrast == "bright" else (-counts, -1)
+    return _Scene(counts, image, valid, sign, pixel_noise(counts, valid), blur_sigma_px, unit)
+
+
+def _refined(raised: Relief, places: Places, search: float, centroid: float) -> Places:
+    """Return places moved to the local maximum within ``search`` px, then to the centroid around it."""
+    climbed = climb(raised.height, raised.bins(places), search / raised.step)
+    return raised.px(centroids(raised.height, climbed, centroid / raised.step))
+
+
+def _seeds(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None) -> tuple[_Seeds, float]:
+    """Return the seeds and their spacing in px."""
+    if given is None and settings.method == "auto":
+        return _automatic(scene, settings)
+    if given is None and settings.method == "lattice":
+        return _on_lattices(scene, settings)
+    if given is None and settings.method in METHODS:
+        return _detected(scene, settings)
+    where = "seeds"
+    if given is None:
+        if settings.csv is None:
+            raise SettingsError(
+                "there is no file to take the columns from",
+                "setting csv (ColumnSettings)",
+                "the path of a CSV file for method csv",
+                "none",
+                "Give it, or choose method auto",
+            )
+        given, where = read_columns_csv(settings.csv), settings.csv
+    seeds = _Seeds(positions(given), schema.texts(given["kind"].to_numpy()), given["column_id"].to_numpy(), True)
+    check_inside(given, scene.valid.shape, where)
+    measured = None if settings.spacing_px else neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing
+    return seeds, settings.spacing_px or measured or 0.0
+
+
+def _automatic(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
+    if settings.spacing_px is None:
+        lattice: Lattice | None = _lattice_of(scene, settings)
+    else:
+        lattice = scene.lattice(settings.spacing_px)
+    spacing = lattice.spacing if lattice else float(settings.spacing_px or 0)
+    places = find_peaks(scene.relief(spacing), lattice, spacing, settings.min_amplitude)
+    if not len(places):
+        raise _none_stands_out(scene, settings)
+    number = np.arange(1, len(places) + 1)
+    return _Seeds(places, np.full(len(places), ""), number, False), neighbour_distance(places) or spacing
+
+
+def _detected(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
+    """Return the seeds that a detector finds, without a lattice."""
+    detector = make_detector(scene.counts, scene.valid, settings, blur_sigma_px=scene.blur_sigma_px)
+    places, _ = detector(scene.counts, scene.valid)
+    if not len(places):
+        raise _none_stands_out(scene, settings)
+    number = np.arange(1, len(places) + 1)
+    return _Seeds(places, np.full(len(places), ""), number, False), detector.spacing_px
+
+
+def _none_stands_out(scene: _Scene, settings: ColumnSettings) -> InputError:
+    return InputError(
+        "no column stands out of the noise",
+        "columns",
+        f"columns {'brighter' if scene.sign > 0 else 'darker'} than their surroundings",
+        "none",
+        f"Check the contrast (now {settings.contrast}) and spacing_px, or give the columns in a CSV file",
+    )
+
+
+def _lattice_of(scene: _Scene, settings: ColumnSettings) -> Lattice:
+    lattice = scene.lattice()
+    if lattice is None:
+        raise InputError(
+            "the summed image shows no lattice, so the distance between columns is not known",
+            "columns",
+            "a periodic image",
+            "none of its shifts matches it",
+            f"Give spacing_px, or a CSV file, and check the contrast (now {settings.contrast}) and the drift",
+        )
+    return lattice
+
+
+def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float]:
+    """Return the sites of all lattices inside the image; a site that two lattices share belongs to the first."""
+    sites = lattice_sites(settings.lattices, scene.valid.shape)
+    seeds = _Seeds(positions(sites), schema.texts(sites["kind"].to_numpy()), sites["column_id"].to_numpy(), False)
+    finest = settings.spacing_px or sites.attrs["spacing_px"]
+    shared = _twins(seeds.places, _SAME * finest)
+    distinct = np.delete(seeds.places, list(shared), axis=0)
+    return seeds, settings.spacing_px or neighbour_distance(distinct) or finest
+
+
+def _corners(places: Places, window: int, valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return whether each window is wholly on exposed pixels, and its first pixel (x, y)."""
+    corner = np.rint(places).astype(np.int64) - window // 2
+    inside = np.all((corner >= 0) & (corner + window <= np.array(valid.shape[::-1])), axis=1)
+    for column in np.flatnonzero(inside):
+        x, y = corner[column]
+        inside[column] = valid[y : y + window, x : x + window].all()
+    return inside, corner
+
+
+def _fit(
+    scene: _Scene,
+    places: Places,
+    corner: NDArray[np.int64],
+    inside: NDArray[np.bool_],
+    kind: NDArray[np.str_],
+    window: int,
+    search: float,
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return (n, 7) fits, NaN where the window leaves the image, and (n,) flags.
+
+    What a first fit makes of a weak column may reach out to its neighbours. Where its shape is unusual for its kind, it
+    is fitted again with about the usual one (mostly flagged at_bound), as the paper bounds fits by its columns' size.
+    """
+    fit = np.full((len(places), 7), np.nan)
+    status = np.where(inside, 0, Status.OUTSIDE_FRAME).astype(np.uint8)
+    if not inside.any():
+        return fit, status
+    x, y = corner[inside].T
+    windows = cut_windows(scene.counts[None], y[None], x[None], window, scene.blur_sigma_px)[0]
+    start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
+    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200, "radius_px": window / 2}
+    fits = fit_gaussians(windows, start, lower, upper, **options)
+    odd = _odd_shapes(fits, kind[inside], start, lower, upper)
+    if odd.any():
+        again = fit_gaussians(windows[odd], start[odd], lower[odd], upper[odd], **options)
+        for name in ("estimates", "status"):
+            getattr(fits, name)[odd] = getattr(again, name)
+    fit[inside] = fits.estimates
+    fit[inside, X] += x
+    fit[inside, Y] += y
+    weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.noise * damping(scene.blur_sigma_px))
+    flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: ~fits.converged, Status.AT_BOUND: fits.at_bound}
+    for flag, found in flags.items():
+        status[inside] |= np.where(found, flag, Status.OK).astype(np.uint8)
+    return fit, status
+
+
+def _odd_shapes(
+    fits: GaussianFits, kind: NDArray[np.str_], start: Places, lower: Places, upper: Places
+) -> NDArray[np.bool_]:
+    """Return which fits failed or are of a shape unusual for their kind; bind theirs to the usual one, in place."""
+    odd = np.zeros(len(kind), dtype=bool)
+    for name in np.unique(kind):
+        same = kind == name
+        if same.sum() < _FEWEST_FOR_SHAPE:
+            continue
+        usual = np.nanmedian(fits.estimates[same][:, [SIGMA_A, SIGMA_B]], axis=0)
+        too_wide = fits.estimates[:, SIGMA_A] > usual[0] * _SHAPE_FACTOR
+        too_narrow = fits.estimates[:, SIGMA_B] < usual[1] / _SHAPE_FACTOR
+        some = same & (too_wide | too_narrow | ~fits.converged)
+        start[some, SIGMA_A : SIGMA_B + 1] = usual
+        lower[some, SIGMA_A : SIGMA_B + 1] = usual[1] / _SHAPE_MARGIN
+        upper[some, SIGMA_A : SIGMA_B + 1] = usual[0] * _SHAPE_MARGIN
+        odd |= some
+    return odd
+
+
+def _bounds(windows: NDArray[np.float32], at: Places, sign: int, search: float) -> tuple[Places, Places, Places]:
+    """Return start values and bounds, each (n, 7): the amplitude has the contrast's sign, sigmas fit the window."""
+    n, size, _ = windows.shape
+    low, high = windows.min(axis=(1, 2)).astype(np.float64), windows.max(axis=(1, 2)).astype(np.float64)
+    span = high - low + 1e-12
+    start, lower, upper = np.zeros((3, n, 7))
+    surroundings = np.quantile(windows, 0.25 if sign > 0 else 0.75, axis=(1, 2))
+    start[:, AMPLITUDE] = sign * 0.8 * span
+    start[:, [X, Y]], start[:, BACKGROUND] = at, surroundings
+    start[:, SIGMA_A], start[:, SIGMA_B] = size / 5, size / 5
+    lower[:, AMPLITUDE], upper[:, AMPLITUDE] = np.sort([0 * span, sign * 5 * span], axis=0)
+    lower[:, [X, Y]], upper[:, [X, Y]] = at - search, at + search
+    lower[:, [SIGMA_A, SIGMA_B]], upper[:, [SIGMA_A, SIGMA_B]] = 0.5, size
+    lower[:, THETA], upper[:, THETA] = -np.inf, np.inf
+    lower[:, BACKGROUND], upper[:, BACKGROUND] = low - 5 * span, high + 5 * span
+    return start, lower, upper
+
+
+def _twins(places: Places, distance: float) -> dict[int, int]:
+    """Return which places to drop, each with the one that stands for it: an earlier one within ``distance``."""
+    twins: dict[int, int] = {}
+    for first, second in sorted(map(sorted, cKDTree(places).query_pairs(distance, output_type="ndarray").tolist())):
+        if first not in twins:
+            twins.setdefault(second, first)
+    return twins
+
+
+def _reading_order(places: Places, thickness: float) -> NDArray[np.int64]:
+    """Return the order by rows from the top, then by x; a row reaches ``thickness`` px below its topmost place."""
+    row = np.zeros(len(places), dtype=np.int64)
+    top, current = -np.inf, -1
+    for place in np.lexsort((places[:, 0], places[:, 1])):
+        if places[place, 1] > top + thickness:
+            top, current = places[place, 1], current + 1
+        row[place] = current
+    return np.lexsort((places[:, 0], row))

@@ -1,0 +1,394 @@
+"""Finding columns without being told where: the lattice of an image, and the peaks that sit on it."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+from scipy.spatial import cKDTree
+
+from ...kernels.blur import blur
+from ...kernels.peaks import box_means, local_maxima
+
+Floats = NDArray[np.floating[Any]]
+Places = NDArray[np.float64]
+"""(n, 2) rows of (x, y), px."""
+Mask = NDArray[np.bool_]
+
+TOLERANCE = 0.2
+"""How far from its lattice site a column may be, in spacings."""
+
+_SAME_LATTICE = 0.8
+"""Correlation, against the highest, from which a shift carries the lattice onto itself."""
+_ORDERED = 0.4
+"""Correlation from which an image has a lattice at all; half of it will do where the spacing is given."""
+_OVERLAP = 0.25
+"""Share of the image that must still lie on itself after a shift."""
+_LARGE = 1500
+"""Shorter side, in px, from twice which on the image is binned before it is correlated."""
+_NOISIEST = 3.0
+"""Correlation without a shift, which noise lifts above 1, up to which a lattice can be found."""
+_PX_PER_SPACING = 24
+"""Pixels on which the distance between columns is seen: peaks are looked for in an image binned so far."""
+_MARGIN = 3
+"""The shortest shift, px, that may be a lattice vector."""
+_COARSE = 16
+"""Smoothing by so many px or more is done on bins of a sixteenth of it."""
+_SAMPLE = 1 << 20
+"""Of more values than these, statistics are taken from a sample."""
+_STRONG = 0.5
+_ALIKE = 0.7
+_SIGNIFICANT = 4.0
+_CLOSE = 0.7
+"""See :func:`find_peaks`."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The two shortest independent translations of a lattice, (x, y) in px; ``a`` is the shorter one."""
+
+    a: tuple[float, float]
+    b: tuple[float, float]
+
+    @property
+    def spacing(self) -> float:
+        """Shortest distance between two sites, px."""
+        return float(np.hypot(*self.a))
+
+    @property
+    def hole(self) -> float:
+        """Farthest that a place inside the lattice can be from every site, px: the circumradius of a, b, b - a."""
+        a, b = np.array(self.a), np.array(self.b)
+        b = b if a @ b >= 0 else -b
+        sides = np.hypot(*a) * np.hypot(*b) * np.hypot(*(b - a))
+        return float(sides / (2 * abs(a[0] * b[1] - a[1] * b[0])))
+
+    def translations(self, reach: int) -> Places:
+        """Return the lattice vectors of up to ``reach`` steps along each axis, without zero."""
+        steps = [step for step in product(range(-reach, reach + 1), repeat=2) if step != (0, 0)]
+        return np.asarray(np.array(steps, dtype=np.float64) @ np.array([self.a, self.b]))
+
+
+@dataclass(frozen=True)
+class Relief:
+    """An image in which columns stand out, of bins of ``step`` x ``step`` px; places are in px all the same.
+
+    Attributes
+    ----------
+    height
+        (y, x); columns bright, their surroundings about zero.
+    valid
+        (y, x) where the image has been exposed.
+    noise
+        Standard deviation of ``height`` where there is nothing.
+    """
+
+    height: Floats
+    valid: Mask
+    noise: float
+    step: int
+
+    def bins(self, places: Places) -> Places:
+        """Return places (x, y) in px as places in bins."""
+        return np.asarray((places + 0.5) / self.step - 0.5)
+
+    def px(self, places: Places) -> Places:
+        """Return places (x, y) in bins as places in px."""
+        return np.asarray((places + 0.5) * self.step - 0.5)
+
+
+def find_lattice(
+    image: Floats, valid: Mask, noise: float, blur_sigma_px: float, spacing_px: float | None = None
+) -> Lattice | None:
+    """Return the lattice of an image from its autocorrelation, or None where it has none.
+
+    Shifted by a lattice vector, an image correlates with itself almost as well as unshifted; shifted from one
+    sublattice to another it does so less, for strong columns then meet weak ones. So of the autocorrelation's maxima
+    the lattice vectors are those that reach 0.8 of the highest; the shortest is ``a``. Among those in other directions
+    ``b`` is found in the same way (by itself, for a surface may have many columns along and few rows down).
+    Sublattices whose amplitudes differ by less than a factor of two count as one.
+
+    Parameters
+    ----------
+    image, valid
+        (y, x), and where it has been exposed.
+    noise
+        Standard deviation of the noise of a pixel.
+    blur_sigma_px
+        Blur before the correlation.
+    spacing_px
+        Length of ``a``, where it is known: the best within a quarter of it is taken.
+    """
+    step = max(1, min(image.shape) // _LARGE)
+    blurred = blur(binned(image, step).astype(np.float32), blur_sigma_px / step)
+    noise *= damping(blur_sigma_px / step) / step
+    heights, shifts = _autocorrelation(blurred, binned(valid, step) == 1, noise)
+    shifts = step * shifts
+    length = np.hypot(shifts[:, 0], shifts[:, 1])
+    least = _ORDERED
+    if spacing_px is not None:
+        shifts, heights, length = (values[length > 0.75 * spacing_px] for values in (shifts, heights, length))
+        least = _ORDERED / 2
+    a = _shortest(shifts, np.where(length < 1.25 * (spacing_px or np.inf), heights, 0.0), least)
+    if a is None:
+        return None
+    sine = (shifts[:, 0] * a[1] - shifts[:, 1] * a[0]) / (length * np.hypot(*a))
+    b = _shortest(shifts, np.where(np.abs(sine) > 0.3, heights, 0.0), least)
+    if b is None:
+        return None
+    b = b - a * round(float(a @ b / (a @ a)))
+    a, b = sorted((a, b), key=lambda vector: float(vector @ vector))
+    return Lattice((float(a[0]), float(a[1])), (float(b[0]), float(b[1])))
+
+
+def _shortest(shifts: Places, heights: Floats, least: float) -> Places | None:
+    """Return the shortest shift (x, y) that is nearly as high as the highest; None where none is high enough."""
+    high = np.flatnonzero(heights >= max(least, _SAME_LATTICE * heights.max(initial=0.0)))
+    return shifts[min(high, key=lambda n: float(shifts[n] @ shifts[n]))] if len(high) else None
+
+
+def binned(image: Floats | Mask, step: int) -> Places:
+    """Return the means of blocks of ``step`` pixels, without the rest at the right and the bottom."""
+    ny, nx = (size // step for size in image.shape)
+    rows = image[: ny * step, : nx * step].reshape(ny, step, nx * step).mean(axis=1, dtype=np.float64)
+    return np.asarray(rows.reshape(ny, nx, step).mean(axis=2))
+
+
+def expanded(bins: Floats, shape: tuple[int, int], step: int, first: tuple[float, float]) -> Floats:
+    """Return ``bins`` on pixels, interpolated linearly; a product with two matrices of weights.
+
+    Parameters
+    ----------
+    shape
+        (y, x) of the result.
+    step
+        Pixels from one bin to the next.
+    first
+        Pixel (y, x) on which bin 0 lies. Beyond the bins their edge goes on.
+    """
+    bins = bins.astype(np.float32)
+    down, across = (
+        np.maximum(0.0, 1.0 - np.abs(np.clip((np.arange(n)[:, None] - start) / step, 0, m - 1) - np.arange(m)))
+        for n, m, start in zip(shape, bins.shape, first, strict=True)
+    )
+    return np.asarray(down.astype(np.float32) @ bins @ across.T.astype(np.float32))
+
+
+def sample(values: Floats) -> Floats:
+    """Return about a million of the values, evenly spaced, where there are more."""
+    return values[:: max(1, len(values) // _SAMPLE)]
+
+
+def _autocorrelation(image: Floats, valid: Mask, noise: float) -> tuple[Floats, Places]:
+    """Return the heights and shifts (x, y) of the maxima of an image's autocorrelation, one of each opposite pair.
+
+    The image is freed of its slow background and of outliers. Its autocorrelation is divided by that of its envelope
+    (the local rms contrast, less the noise), so that a perfect lattice reaches about 1 however thick the crystal, and
+    however much of the image is vacuum; and multiplied by the square root of the envelopes' overlap, so that a long
+    shift must be better than a short one. None where the noise outweighs the columns.
+    """
+    wide = min(image.shape) / 8
+    flat = np.where(valid, image - smooth(image, wide), np.float32(0))
+    flat = np.clip(flat, *np.percentile(sample(flat[valid]), [0.5, 99.5]).astype(np.float32)) * valid
+    correlation = _correlate(flat)
+    step = _coarseness(wide)
+    share = binned(valid, step)
+    power = smooth(binned(flat**2, step), wide / step) / np.maximum(smooth(share, wide / step), 1e-3)
+    coarse = step**2 * _correlate(np.sqrt(np.maximum(power - noise**2, 0.0)) * share)
+    centre, middle = (_MARGIN, correlation.shape[1] // 2), (_MARGIN, coarse.shape[1] // 2)
+    overlap = expanded(coarse, correlation.shape, step, (centre[0] - step * middle[0], centre[1] - step * middle[1]))
+    level = overlap[centre]
+    if not 0 < correlation[centre] < _NOISIEST * level:
+        return np.empty(0), np.empty((0, 2))
+    correlation *= np.where(overlap >= _OVERLAP * level, 1 / np.sqrt(np.maximum(overlap, _OVERLAP * level) * level), 0)
+    places = local_maxima(correlation.astype(np.float32), float(_MARGIN), _ORDERED / 4)
+    inside = (places > 0) & (places < np.array(correlation.shape[::-1]) - 1)
+    x, y = places[inside.all(axis=1)].astype(np.int64).T
+    heights = correlation[y, x]
+    shifts = np.stack([x + _vertex(correlation, y, x, 0, 1), y + _vertex(correlation, y, x, 1, 0)], axis=1)
+    shifts -= centre[::-1]
+    half = (y > centre[0]) | ((y == centre[0]) & (x > centre[1]))
+    half &= np.hypot(shifts[:, 0], shifts[:, 1]) > _MARGIN
+    return heights[half], shifts[half]
+
+
+def _correlate(image: Floats) -> Floats:
+    """Return the autocorrelation of an image for shifts of up to half of it.
+
+    Only one of each opposite pair of shifts is there: down by -3 px (``_MARGIN``) and more, along x the middle is zero.
+    """
+    down, across = (n // 2 for n in image.shape)
+    size = [fft.next_fast_len(n + n // 2 + 1, real=True) for n in image.shape]
+    spectrum = np.abs(fft.rfft2(image.astype(np.float32), s=size)) ** 2
+    whole = fft.irfft2(spectrum, s=size)
+    rows, columns = np.arange(-_MARGIN, down + 1), np.arange(-across, across + 1)
+    return np.ascontiguousarray(whole[rows][:, columns])
+
+
+def _vertex(values: Floats, y: NDArray[np.int64], x: NDArray[np.int64], dy: int, dx: int) -> Floats:
+    """Return how far from the maxima (y, x) the parabola through them and their two neighbours has its vertex."""
+    before, at, after = values[y - dy, x - dx], values[y, x], values[y + dy, x + dx]
+    bend = before - 2 * at + after
+    return np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+
+
+def smooth(image: Floats, sigma: float) -> Floats:
+    """Return ``image`` smoothed by about a Gaussian of ``sigma`` px, three passes of a box; a wide one on bins."""
+    step = _coarseness(sigma)
+    radius = round((np.sqrt(4 * (sigma / step) ** 2 + 1) - 1) / 2)
+    bins = image if step == 1 else binned(image, step)
+    for _ in range(3):
+        bins = box_means(bins, radius)
+    return bins if step == 1 else expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
+
+
+def _coarseness(sigma: float) -> int:
+    """Return how far an image may be binned before it is smoothed by ``sigma`` px."""
+    return max(1, int(sigma / _COARSE))
+
+
+def pixel_noise(image: Floats, valid: Mask) -> float:
+    """Return the standard deviation of the white noise of an image, from its second differences (Immerkær 1996).
+
+    Of a large image some rows are taken.
+    """
+    ny, nx = image.shape
+    rows = np.arange(1, ny - 1, max(1, ny * nx // _SAMPLE))
+    bend = image[rows - 1] - 2 * image[rows] + image[rows + 1]
+    bend = np.abs(bend[:, :-2] - 2 * bend[:, 1:-1] + bend[:, 2:]) / 6
+    return float(np.median(bend[valid[rows, 1:-1]]) / 0.6745)
+
+
+def damping(sigma: float) -> float:
+    """Return the share of white noise's standard deviation that a Gaussian blur of ``sigma`` px leaves."""
+    return min(1.0, 1 / (2 * np.sqrt(np.pi) * sigma)) if sigma > 0 else 1.0
+
+
+def relief(
+    image: Floats, valid: Mask, noise: float, spacing: float, blur_sigma_px: float, precision_px: float = np.inf
+) -> Relief:
+    """Return the image in which columns ``spacing`` px apart stand out.
+
+    Binned to 24 px a spacing, but to no more than ``precision_px``; blurred to 0.08 of the spacing (a column is about
+    twice as wide); less the surroundings over a third of it.
+    """
+    step = max(1, int(min(spacing / _PX_PER_SPACING, precision_px)))
+    sigma = max(blur_sigma_px, 0.08 * spacing) / step
+    fine = blur(binned(image, step).astype(np.float32), sigma)
+    height = (fine - smooth(fine, spacing / 3 / step)).astype(np.float32)
+    return Relief(height, binned(valid, step) == 1, damping(sigma) * noise / step, step)
+
+
+def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_amplitude: float) -> Places:
+    """Return the columns of the dominant sublattice and strong ones beside it, (n, 2) of (x, y), strongest first.
+
+    1. Peaks: local maxima of ``relief`` within a fifth of the spacing, four times its noise high or more.
+    2. Start: the peak with the highest lattice neighbours: by the median of all eight, or by its own height if that is
+       less. It is on the dominant sublattice, even where a speck of dirt is the brightest thing in the image.
+    3. Growth: from each accepted peak, strongest first, the strongest peak within a fifth of the spacing of each site
+       that is one or two lattice steps away is accepted, if it is at least ``min_amplitude`` of the median. Sites are
+       predicted from neighbours, so strain and slow distortion are followed. A peak of less than half the median must
+       sit on the sites of most of the accepted ones within two steps, so that chains of noise lead nowhere. What is
+       nearer than 0.7 spacings to a peak of its own sublattice is not accepted.
+    4. Other sublattices are grown in the same way, and accepted if their start and their median reach 0.7 of the
+       first's: the second column of a dumbbell, a shifted terrace, another grain. Weaker ones, such as oxygen between
+       cerium, are left alone.
+    5. Off every lattice: a peak of half the median or more that is farther from all accepted ones than any place inside
+       the lattice could be is accepted: an adatom, a step edge.
+
+    Parameters
+    ----------
+    relief
+        Peaks are looked for where it is valid.
+    lattice
+        None: there is no growth, and strong peaks at least 0.75 spacings apart are returned.
+    spacing
+        In px, as the lattice.
+    """
+    height = relief.height
+    floor = max(_SIGNIFICANT * relief.noise, 1e-9 * float(np.ptp(height)))
+    peaks = local_maxima(height, max(TOLERANCE * spacing / relief.step, 1.5), floor)
+    x, y = peaks.astype(np.int64).T
+    inside = ndimage.binary_erosion(relief.valid)[y, x]  # a maximum on the rim is the flank of a column outside
+    strongest_first = np.argsort(-height[y, x], kind="stable")
+    strongest_first = strongest_first[inside[strongest_first]]
+    peaks, weights = relief.px(peaks[strongest_first]), height[y, x][strongest_first]
+    if not len(peaks):
+        return np.empty((0, 2))
+    taken = np.zeros(len(peaks), dtype=bool)
+    if lattice is None:
+        return np.asarray(peaks[_spread(peaks, taken, weights >= _STRONG * np.quantile(weights, 0.95), 0.75 * spacing)])
+    start, support = _start(peaks, weights, lattice)
+    median = support or float(weights[start])
+    for _ in range(2):  # the median is that of the columns, which the first pass finds
+        taken = _grow(peaks, weights, lattice, start, min_amplitude * median, _STRONG * median)
+        median = float(np.median(weights[taken]))
+    weakest, strong = min_amplitude * median, _STRONG * median
+    while True:
+        left = np.where(taken, 0.0, weights)
+        start, support = _start(peaks, left, lattice)
+        group = _grow(peaks, left, lattice, start, weakest, strong)
+        if min(support, np.median(left[group])) < _ALIKE * median:
+            break
+        taken |= group
+    return np.asarray(peaks[_spread(peaks, taken, weights >= strong, 1.1 * lattice.hole)])
+
+
+def _start(peaks: Places, weights: Floats, lattice: Lattice) -> tuple[int, float]:
+    """Return the peak of step 2 of :func:`find_peaks` (of few columns, one of the highest pair), and its measure."""
+    sites = peaks[:, None] + lattice.translations(1)
+    distance, neighbour = cKDTree(peaks).query(sites, distance_upper_bound=TOLERANCE * lattice.spacing)
+    heights = np.where(np.isfinite(distance), np.append(weights, 0.0)[neighbour], 0.0)
+    support = np.minimum(weights, np.median(heights, axis=1))
+    pair = np.minimum(weights, heights.max(axis=1))
+    start = int(np.lexsort((weights, pair, support))[-1])
+    return start, float(support[start])
+
+
+def _grow(peaks: Places, weights: Floats, lattice: Lattice, start: int, weakest: float, strong: float) -> Mask:
+    """Return which of the peaks, strongest first, belong to the sublattice of one: step 3 of :func:`find_peaks`."""
+    tree = cKDTree(peaks)
+    taken = np.zeros(len(peaks), dtype=bool)
+    blocked = weights < max(weakest, np.finfo(float).tiny)
+    blocked[start] = False
+    queue = [start]
+    while queue:
+        peak = heapq.heappop(queue)
+        weak = weights[peak] < strong and peak != start
+        if blocked[peak] or (weak and not _agreed(peak, peaks, tree, taken, lattice)):
+            continue
+        taken[peak] = True
+        blocked[tree.query_ball_point(peaks[peak], _CLOSE * lattice.spacing)] = True
+        sites = peaks[peak] + lattice.translations(2)
+        for near in tree.query_ball_point(sites, TOLERANCE * lattice.spacing):
+            free = [other for other in near if not blocked[other]]
+            if free:
+                heapq.heappush(queue, min(free))
+    return taken
+
+
+def _spread(peaks: Places, taken: Mask, strong: Mask, distance: float) -> Mask:
+    """Return ``taken`` and the strong peaks farther than ``distance`` from it and from those before them."""
+    tree = cKDTree(peaks)
+    taken, crowded = taken.copy(), np.zeros(len(peaks), dtype=bool)
+    for peak in [*np.flatnonzero(taken).tolist(), *np.flatnonzero(strong & ~taken).tolist()]:
+        if taken[peak] or not crowded[peak]:
+            taken[peak] = True
+            crowded[tree.query_ball_point(peaks[peak], distance)] = True
+    return taken
+
+
+def _agreed(peak: int, peaks: Places, tree: cKDTree, taken: Mask, lattice: Lattice) -> bool:
+    """Tell whether a peak sits on the lattice of most of the accepted peaks within two steps of it."""
+    near = [other for other in tree.query_ball_point(peaks[peak], 2 * np.hypot(*lattice.b)) if taken[other]]
+    if not near:
+        return False
+    basis = np.array([lattice.a, lattice.b])
+    away = peaks[near] - peaks[peak]
+    off = away - np.rint(away @ np.linalg.inv(basis)) @ basis
+    return bool(np.mean(np.hypot(off[:, 0], off[:, 1]) <= TOLERANCE * lattice.spacing) >= 0.5)

@@ -1,0 +1,255 @@
+"""Columns from a summed image, as a table that may be edited."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, count
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import xarray as xr
+
+from ...errors import DestinationError
+from ...progress import Sink, StageDone, StageStarted, Warned, silent
+from ...run.columns_picture import draw_columns
+from ...settings.run import ColumnSettings, FitSettings
+from ...store import datasets, files, metadata
+from ...store.columns import check_inside, read_columns_csv, write_columns_csv
+from ...store.keys import counted
+from ...store.provenance import stage_key
+from ...store.schema import Status
+from ..keep import Aside, at_once, content, save
+
+_OUR_TABLE = b"column_id,x,y,kind,"
+"""How a table begins that a run has written."""
+
+
+def columns_stage(
+    summed: xr.Dataset,
+    csv: Path,
+    settings: ColumnSettings,
+    fit_settings: FitSettings,
+    on_event: Sink = silent,
+    *,
+    overwrite: bool = False,
+    aside: Aside = at_once,
+) -> xr.Dataset:
+    """Return the columns of a summed image, kept as the table ``csv``, with ``.zarr`` and ``.png`` of the same name.
+
+    Where the table was edited by hand since, its columns are refined and returned instead, and the table is left
+    as it is, whatever other setting changes; only another method or file of columns takes its place, after it was put
+    away. The figure is drawn by ``aside``.
+
+    Raises
+    ------
+    DestinationError
+        Where ``csv`` is a table of other origin.
+    """
+    from .find import find_columns  # workers, which are forked once this room is imported, do not need it
+
+    store, figure = csv.with_suffix(".zarr"), csv.with_suffix(".png")
+    window, blur = fit_settings.window_px, fit_settings.blur_sigma_px
+    find = partial(find_columns, summed, window_px=window, blur_sigma_px=blur)
+    before = _Table.read(csv, settings)
+    if before.is_foreign and not overwrite:
+        raise DestinationError(
+            "this table was not written by tract-dask",
+            str(csv),
+            "nothing, or a table of an earlier run",
+            "another file",
+            "Choose another place, say --overwrite, or give the table as --columns",
+        )
+    counts = counted("columns", columns=settings, fit=fit_settings)
+    key = _columns_key(summed, counts, before.seeds)
+    about, pixel_size = before.about, summed.attrs.get("pixel_size_pm")
+    same = bool(before.content) and about.get("key") == key
+    if same and figure.exists() and about.get("pixel_size_pm") == pixel_size:
+        on_event(StageDone("columns", 0.0, reused=True))
+        return reopened(store)
+    began = perf_counter()
+    on_event(StageStarted("columns", 0))
+    if same:
+        found, edited = reopened(store), before.is_edited
+    else:
+        found, edited = _found(find, before, settings, on_event)
+        key = _columns_key(summed, counts, before.content if edited else before.given)
+    found.attrs["pixel_size_pm"] = pixel_size
+    table = before.content if same or edited else _render(found, csv)
+    if table != before.content:
+        before.make_room(on_event)  # before the store, which would else take the old table for an edited one
+    known = {"table": _digest(table), "edited": edited, "seeds": before.origin, "pixel_size_pm": pixel_size}
+    save(found, store, key, settings, "columns", **known)
+    if not csv.exists():
+        files.write_aside(csv, table)
+    figure.unlink(missing_ok=True)  # it is of other columns
+    aside(partial(draw_columns, summed, found.copy(), figure))
+    on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
+    return found
+
+
+def check_edited(csv: Path, settings: ColumnSettings, shape: tuple[int, ...]) -> None:
+    """Check a table that was edited by hand, from which :func:`columns_stage` will start in images of ``shape`` (y, x).
+
+    Raises
+    ------
+    SettingsError
+        Where it cannot be read, or columns lie outside the image.
+    DestinationError
+        Where something else has its place: a link that leads nowhere may be one to columns that were edited.
+    """
+    if os.path.lexists(csv) and not csv.is_file():
+        raise DestinationError(
+            "the table of columns cannot be reached",
+            str(csv),
+            "a file, or nothing",
+            f"a link to {csv.readlink()}, which is not there" if csv.is_symlink() else "no file",
+            "Bring it back, or move what is there away: then columns are found anew",
+        )
+    if _Table.read(csv, settings).is_edited:
+        check_inside(read_columns_csv(csv), shape, str(csv))
+
+
+def _columns_key(summed: xr.Dataset, counts: dict[str, Any], seeds: bytes) -> str:
+    """Return the key of the columns: other drifts may give the same image, but displaced, or of fewer frames."""
+    image, exposure = (summed[name].to_numpy() for name in ("image", "exposure"))
+    return stage_key("columns", image, exposure, summed.attrs.get("rounding_px"), counts, seeds)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A table of columns that an earlier run may have left.
+
+    Attributes
+    ----------
+    content
+        What it holds; empty where there is none.
+    about
+        What the store beside it says of itself.
+    given
+        What the file holds that the settings name for method csv; empty for other methods.
+    origin
+        What the settings take columns from. Another origin ends what was edited.
+    is_given
+        Whether the settings name this very table.
+    """
+
+    csv: Path
+    content: bytes
+    about: dict[str, Any]
+    given: bytes
+    origin: dict[str, str]
+    is_given: bool
+
+    @classmethod
+    def read(cls, csv: Path, settings: ColumnSettings) -> _Table:
+        by_file = settings.method == "csv" and settings.csv is not None
+        given = content(settings.csv) if by_file else b""
+        origin = {"method": settings.method, "csv": _digest(given)}
+        about = metadata.attributes(csv.with_suffix(".zarr"))
+        return cls(csv, content(csv), about, given, origin, by_file and Path(settings.csv or "").absolute() == csv)
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether it is not as a run has written it."""
+        found = bool(self.content and self.about)
+        return found and (_digest(self.content) != self.about.get("table") or bool(self.about.get("edited")))
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether it is none that a run has written."""
+        return bool(self.content) and not self.about and not self.content.startswith(_OUR_TABLE) and not self.is_given
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether its columns are to be refined, and not found anew."""
+        return bool(self.content) and (
+            self.is_given or (self.is_changed and self.about.get("seeds", self.origin) == self.origin)
+        )
+
+    @property
+    def seeds(self) -> bytes:
+        """The table that columns are taken from; empty where they are looked for."""
+        return self.content if self.is_edited else self.given
+
+    def make_room(self, on_event: Sink) -> None:
+        """Take the table away for another: for ever, where it is as a run has written it."""
+        now = content(self.csv)
+        if now and (self.is_changed or not self.about or now != self.content):
+            put_away(self.csv, on_event)
+        self.csv.unlink(missing_ok=True)
+
+
+def _found(
+    find: Callable[[ColumnSettings], xr.Dataset], before: _Table, settings: ColumnSettings, on_event: Sink
+) -> tuple[xr.Dataset, bool]:
+    """Return the columns that an edited table or else the settings lead to, and whether the table does.
+
+    A table of ours whose store is gone is an edited one, unless it is just what the settings lead to.
+    """
+    lost = bool(before.content) and not before.about and not before.is_foreign
+    if not before.is_edited:
+        found = find(settings)
+        if not lost or _render(found, before.csv) == before.content:
+            return found, False
+    on_event(Warned(f"{before.csv.name} was edited: your columns are kept, and refined on the summed image"))
+    return find(dataclasses.replace(settings, method="csv", csv=str(before.csv))), True
+
+
+def reopened(store: Path) -> xr.Dataset:
+    """Return the columns in ``store`` as they were found: without provenance."""
+    found = datasets.open_dataset(store)
+    del found.attrs[metadata.ATTRIBUTE]
+    return found
+
+
+def _render(columns: xr.Dataset, csv: Path) -> bytes:
+    """Return the table of ``columns`` as it will stand in ``csv``."""
+    aside = csv.with_name(f".{csv.name}.partial")
+    write_columns_csv(columns, aside)
+    table = aside.read_bytes()
+    aside.unlink()
+    return table
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _columns_summary(columns: xr.Dataset) -> str:
+    outside = int(((columns["status_ref"].to_numpy() & Status.OUTSIDE_FRAME) > 0).sum())
+    merged = len(columns.attrs.get("merged", ()))
+    parts = (
+        f"{columns.sizes['column_id']} columns",
+        f"{outside} outside the frame" if outside else "",
+        f"{merged} seeds merged" if merged else "",
+    )
+    return ", ".join(filter(None, parts))
+
+
+def put_away(csv: Path, on_event: Sink) -> None:
+    """Keep a table that was edited by hand under another name, under which nothing lies yet."""
+    names = (csv.with_stem(f"{csv.stem}-edited{suffix}") for suffix in chain([""], (f"-{k}" for k in count(2))))
+    kept = next(path for path in names if not path.exists() or path.read_bytes() == csv.read_bytes())
+    csv.replace(kept)
+    on_event(Warned(f"other columns take the place of {csv.name}: your edited table is now {kept.name}"))
+
+
+def clear_columns(csv: Path, on_event: Sink, *, keep_edited: bool) -> None:
+    """Remove what the columns stage has left at ``csv``; a table that was edited by hand is kept, or put away."""
+    if not metadata.is_sound(csv.with_suffix(".zarr")):
+        files.remove(csv.with_suffix(".zarr"))
+    before = _Table.read(csv, ColumnSettings())
+    edited = before.is_changed or bool(before.content and not before.about)
+    csv.with_suffix(".png").unlink(missing_ok=True)
+    if edited and keep_edited and not before.is_foreign:
+        return
+    if edited:
+        put_away(csv, on_event)
+    csv.unlink(missing_ok=True)
+    files.remove(csv.with_suffix(".zarr"))

@@ -1,0 +1,1 @@
+"""Stage convert: a movie in any format becomes a Zarr store."""

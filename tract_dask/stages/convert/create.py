@@ -1,0 +1,106 @@
+"""The movie store as it is made and finished."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from ...readers.source import SourceMetadata
+from ...settings.run import MetadataSettings
+from ...store import datasets, disk, files, schema
+from ...store import metadata as store_metadata
+from ...store.layout import LEVEL_DTYPE, Layout
+from ...store.ome import AXES, CHANGING, describe
+from ...store.shard_files import CHUNK_KEYS, Grid, codecs
+
+
+def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
+    """Write pixel size, frame time, dose and gain into a movie store, if they differ: coordinates, scales, attributes.
+
+    ``more`` are attributes of the store that are written with them.
+
+    Raises
+    ------
+    StoreError
+        Where it cannot be written.
+    """
+    present, now = store_metadata.attributes(path), quantities(metadata) | more
+    cut_off = present.pop(CHANGING, False)
+    if cut_off or any(present.get(name) != value for name, value in now.items()):
+        mark: dict[str, Any] = {CHANGING: True}
+        with files.disk_errors(path):
+            store_metadata.update_attributes(path, **mark)  # coordinates and root change one after the other
+            describe(path, present | now)
+
+
+def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
+    """Make the store with all its arrays, still empty: whole or not at all."""
+    aside = path.with_name(f".{path.name}.partial")
+    files.remove(aside)
+    zarr.create_group(aside, zarr_format=3)
+    zarr.create_group(aside / "binned", zarr_format=3)
+    _create_array(aside / "0", layout.grid(), layout.dtype, codec)
+    for factor in layout.bins:
+        _create_array(aside / "binned" / str(factor), layout.grid(factor), LEVEL_DTYPE, codec)
+    for axis, length in zip(AXES, layout.shape, strict=True):
+        _create_vector(aside / axis, length, axis, "float64")
+    for variable in schema.STATISTICS.values():
+        _create_vector(aside / variable.name, layout.shape[0], "t", variable.dtype, variable.attributes)
+    plan = {
+        "kind": "movie",
+        "complete": False,
+        "shape": layout.shape,
+        "dtype": layout.dtype.name,
+        "frames_per_shard": layout.frames_per_shard,
+        "chunk": layout.chunk,
+        "bins": layout.bins,
+    }
+    describe(aside, about | plan | quantities(known))
+    disk.place_folder(aside, path)
+
+
+def _create_array(path: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> zarr.Array[Any]:
+    return zarr.create_array(
+        path,
+        shape=grid.shape,
+        chunks=grid.chunk,
+        shards=grid.shard,
+        dtype=dtype,
+        compressors=codecs(codec),
+        chunk_key_encoding=CHUNK_KEYS,
+        fill_value=0,
+        dimension_names=AXES,
+        zarr_format=3,
+    )
+
+
+def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: dict[str, Any] | None = None) -> None:
+    zarr.create_array(
+        path,
+        shape=(length,),
+        chunks=(length,),
+        dtype=dtype,
+        compressors=codecs("zstd"),
+        chunk_key_encoding=CHUNK_KEYS,
+        fill_value=0,
+        dimension_names=(axis,),
+        attributes=attributes,
+        zarr_format=3,
+    )
+
+
+def finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: SourceMetadata) -> None:
+    """Write the statistics (frames,) and the metadata, and say that the store is complete."""
+    with files.disk_errors(path):
+        for name, values in statistics.items():
+            datasets.overwrite_array(path / name, values)
+        disk.sync_folders(path, tuple(statistics))
+        describe(path, store_metadata.attributes(path) | quantities(known) | {"complete": True})
+
+
+def quantities(metadata: SourceMetadata | MetadataSettings) -> dict[str, Any]:
+    return {name: getattr(metadata, name) for name in schema.CALIBRATION}

@@ -1,0 +1,1 @@
+"""Stage drift: how far each frame lies from the first."""

@@ -1,0 +1,1 @@
+"""Stage fit: every column in every frame."""

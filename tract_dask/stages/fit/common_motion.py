@@ -1,0 +1,75 @@
+"""The motion that all columns of a frame share."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...kernels.gaussian.fit import GaussianFits
+from ...kernels.gaussian.intensity import Floats
+from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
+from ...store.schema import REJECTED
+from .job import Job
+
+CERTAIN = 13.8
+"""Chi-squared of two degrees of freedom at 99.9 %."""
+
+
+def common_motion(fits: GaussianFits, status: NDArray[np.uint8], drift: Floats, job: Job) -> Floats:
+    """Return how far the accepted columns of each frame moved together, (frames, 2): what the drift had missed.
+
+    Zero unless it stands out of its own error with 99.9 % certainty (chi-squared of both axes above 13.8):
+    registration, which sees every pixel, is otherwise the better estimate. Zero, too, where fewer than
+    ``refine_columns`` are accepted.
+    """
+    motion = np.zeros_like(drift)
+    if job.refine_columns is None:
+        return motion
+    away = fits.estimates[..., [Y, X]] - drift[:, None] - job.reference[:, [Y, X]]
+    expected = np.sqrt(np.abs(job.reference[:, BACKGROUND]) + np.abs(job.reference[:, AMPLITUDE]) / 2)
+    expected /= np.abs(job.reference[:, AMPLITUDE]) + 1e-12
+    good = (status & REJECTED) == 0
+    enough = good.sum(axis=1) >= job.refine_columns
+    if enough.any():
+        common, error = _biweight(away[enough], expected, good[enough])
+        certain = ((common / error) ** 2).sum(axis=1) > CERTAIN
+        motion[enough] = np.where(certain[:, None], common, 0)
+    return motion
+
+
+def _biweight(values: Floats, expected: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Return the mean of each frame's good ``values`` (frames, n, 2) and its standard error, each (frames, 2).
+
+    Weights are 1 / expected^2, with errors (n,) known up to a factor, times Tukey's biweight at 6 median absolute
+    deviations, so that columns which move by themselves do not count. The standard error is that of the weighted mean,
+    from the spread of the values. Errors that the fits themselves report are no use here: at low dose they follow the
+    noise, and favour the columns that it has made brighter.
+    """
+    # per frame and axis: (frames, 2, n)
+    values = np.where(good[:, None], np.swapaxes(values, 1, 2), 0)
+    counted = np.broadcast_to(good[:, None], values.shape)
+    precision = counted / expected**2
+    centre = masked_median(values, counted)
+    weight = precision
+    for _ in range(10):
+        pull = np.abs(values - centre[..., None]) / expected
+        scale = 6 * masked_median(pull, counted)[..., None] + 1e-12
+        weight = np.clip(1 - (pull / scale) ** 2, 0, None) ** 2 * precision
+        centre = (weight * values).sum(axis=-1) / weight.sum(axis=-1)
+    error = np.sqrt((weight**2 * (values - centre[..., None]) ** 2).sum(axis=-1)) / weight.sum(axis=-1)
+    return centre, np.maximum(error, 1e-12)
+
+
+def masked_median(values: Floats, good: NDArray[np.bool_]) -> Floats:
+    """Return the median of the good values along the last axis; NaN where there are none.
+
+    Examples
+    --------
+    >>> masked_median(np.array([[3.0, 1.0, 9.0], [5.0, 5.0, 5.0]]), np.array([[True, True, False], [False] * 3]))
+    array([ 2., nan])
+    """
+    ordered = np.sort(np.where(good, values, np.inf), axis=-1)
+    count = good.sum(axis=-1)[..., None]
+    low, high = (np.take_along_axis(ordered, np.maximum(k, 0), axis=-1) for k in ((count - 1) // 2, count // 2))
+    with np.errstate(invalid="ignore"):
+        return np.where(count > 0, (low + high) / 2, np.nan)[..., 0]

@@ -1,0 +1,174 @@
+"""The fit stage: every column of every frame, one task a shard; into results.zarr, or lazily for a notebook."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import xarray as xr
+from distributed import Client
+
+from ...cluster.tasks import stream_shards
+from ...progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
+from ...settings.run import FitSettings
+from ...store import metadata, results
+from ...store.journal import Journal, Payload, journal_beside, remove_journal
+from ...store.keys import counted
+from ...store.movie import Movie
+from ...store.parts import DamagedPartError, write
+from ...store.processor import processor, widths
+from ...store.provenance import provenance, stage_key
+from ...store.schema import REJECTED, Status
+from ...store.shards import Shard
+from ..keep import Workers, is_done
+from . import stage as fit
+from .job import Job, calibration, frame_times, load_job, prepare
+from .join import join
+from .measure import measure
+
+_COUNTS = ("fits", "accepted", "bad_frames")
+
+
+_ATTEMPTS = 3
+"""So often shards are fitted whose fits turn out to be damaged on disk."""
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """What the fit stage did: numbers of fits, of accepted ones, and of frames that could not be fitted."""
+
+    fits: int
+    accepted: int
+    bad_frames: int
+
+
+def fit_movie(
+    movie: Movie, columns: xr.Dataset, job: Job, path: Path, *, client: Client | None = None, on_event: Sink = silent
+) -> FitSummary:
+    """Fit every column in every frame into the store at ``path``; go on where an earlier call stopped.
+
+    A finished store with the same key is left as it is, but for its calibration; one with another key is made anew.
+
+    Parameters
+    ----------
+    job
+        From :func:`prepare`, with the same movie and columns.
+    client
+        The cluster to run on; None runs in this process.
+    """
+    started = perf_counter()
+    key = fit_key(movie, columns, job)
+    about = metadata.attributes(path)
+    if about.get("key") == key and about.get("complete"):
+        remove_journal(journal_beside(path))  # of a run that was killed just before it had removed it
+        results.calibrate(path, frame_times(movie), **calibration(movie))
+        on_event(StageDone("fit", 0.0, reused=True))
+        return FitSummary(**about["summary"])
+    goes_on = about.get("key") == key
+    if not goes_on:
+        remove_journal(journal_beside(path))
+    elif damage := results.damage(path):
+        goes_on = False
+        on_event(Warned(f"{damage.where} is damaged: the store is made anew, with the fits that are done"))
+    if not goes_on:
+        results.create(
+            path,
+            columns,
+            job.drift,
+            frame_times(movie),
+            movie.shards[0].frames,
+            **provenance(key, job.settings, str(movie.path)),
+            **calibration(movie),
+            window=job.window,
+            vacuum=job.vacuum,
+            reference_blur_px=columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px),
+            refine_columns=job.refine_columns,
+        )
+    journal = Journal(journal_beside(path), key, dict.fromkeys(_COUNTS, ()))
+    done_frames = journal.frames_done(movie.shards)
+    on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
+    for attempt in range(_ATTEMPTS):
+        summary, processors = _fit_shards(movie, path, journal, client, on_event)
+        try:
+            join(path, journal, client, on_event, attempt)
+            break
+        except DamagedPartError as error:
+            if attempt == _ATTEMPTS - 1:
+                raise
+            on_event(Warned(f"{error.what}: they are made anew"))
+    results.finish(path, summary=summary, processors=sorted(processors))
+    journal.remove()
+    if len(mixed := widths(processors)) > 1:
+        lanes = " and ".join(map(str, mixed))
+        on_event(Warned(f"processors with vectors of {lanes} numbers took part: last digits depend on which did what"))
+    on_event(
+        StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
+    )
+    return FitSummary(**summary)
+
+
+def _fit_shards(
+    movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink
+) -> tuple[dict[str, int], set[str]]:
+    """Fit the shards that are not on disk; return the counts of all, and the processors that took part."""
+    summary, processors = dict.fromkeys(_COUNTS, 0), set[str]()
+
+    def add(shard: Shard, payload: Payload) -> None:
+        for name in summary:
+            summary[name] += payload[name]
+        processors.add(payload["processor"])
+
+    stream_shards(
+        partial(_fit_task, movie, path, journal.key, journal.path),
+        movie.shards,
+        add,
+        journal=journal,
+        name="fit",
+        client=client,
+        on_done=lambda shard, payload: on_event(ShardDone("fit", shard.index, shard.frames, payload["fits"])),
+        file=str(movie.path),
+        on_event=on_event,
+    )
+    return summary, processors
+
+
+def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
+    """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
+    arrays = (job.reference, job.drift, columns["column_id"].to_numpy().astype(np.int64))
+    vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
+    numbers = [movie.gain, int(job.window), vacuum, job.refine_columns]
+    kinds = [str(kind) for kind in columns["kind"].to_numpy()]
+    return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
+
+
+def _fit_task(movie: Movie, path: Path, key: str, run: Path, shard: Shard) -> Payload:
+    job = load_job(movie, path, key)
+    values = measure(movie, shard, job)
+    write(run, shard, values, movie.shards[0].frames)
+    fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
+    return {
+        "fits": int(fitted.sum()),
+        "accepted": int(((values["status"] & REJECTED) == 0).sum()),
+        "bad_frames": int(job.bad[shard.start : shard.stop].sum()),
+        "processor": processor(),
+    }
+
+
+def fit_stage(
+    movie: Movie,
+    columns: xr.Dataset,
+    drift: xr.Dataset | None,
+    summed: xr.Dataset | None,
+    path: Path,
+    settings: FitSettings,
+    refine_columns: int | None,
+    workers: Workers,
+    on_event: Sink = silent,
+) -> fit.FitSummary:
+    """Fit every column in every frame into ``path``."""
+    job = prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
+    client = None if is_done(path, fit.fit_key(movie, columns, job)) else workers()
+    return fit.fit_movie(movie, columns, job, path, client=client, on_event=on_event)

@@ -1,0 +1,99 @@
+"""Files: written aside, synced and renamed; deleted; read whole."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ..errors import DestinationError, StoreError
+from . import disk
+
+
+def write_aside(path: Path, data: bytes) -> None:
+    """Write a small file so that it is either whole or not there: beside its place first, synced, then renamed."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with disk_errors(path):
+        aside.write_bytes(data)
+        disk.place_now(aside, path)
+
+
+def remove(path: Path) -> None:
+    """Delete a store, a folder or a file, if it is there.
+
+    A folder goes at once for everybody who looks, also where this process is killed meanwhile: renamed, then deleted.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        path.unlink(missing_ok=True)
+        return
+    if not path.name.startswith("."):
+        aside = path.with_name(f".{path.name}.removed")
+        remove(aside)  # of a process that was killed
+        with suppress(FileNotFoundError):
+            path.replace(aside)
+        path = aside
+    with suppress(FileNotFoundError):
+        shutil.rmtree(path)
+
+
+def check_free_space(path: Path, needed: int) -> None:
+    """Check that the disk under ``path`` has ``needed`` bytes free.
+
+    Raises
+    ------
+    DestinationError
+        With both numbers.
+    """
+    free = shutil.disk_usage(next(p for p in (path, *path.absolute().parents) if p.exists())).free
+    if free < needed:
+        raise DestinationError(
+            "the disk is too small for this",
+            str(path),
+            f"about {_readable(needed)} free",
+            _readable(free),
+            "Free some space, or choose another disk",
+        )
+
+
+def _readable(size: int) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn a full disk or a refused write inside this block into a StoreError; other errors of the system name it."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS):
+            error.filename = error.filename or str(path)
+            raise
+        raise StoreError(
+            "writing failed",
+            str(path),
+            got=os.strerror(error.errno),
+            remedy="Free some space or mend the permissions, then run again: what is done is kept",
+        ) from error
+
+
+def read_small(path: str | Path, most: int) -> bytes:
+    """Return what a file of at most ``most`` bytes holds; its size is looked at before anything is read.
+
+    Raises
+    ------
+    OSError
+        Where it cannot be opened, is a folder, a pipe, a device or a socket, or is larger. Nothing is waited for.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError("it is not a file but a folder, a pipe, a device or a socket")
+        data = file.read(most + 1) if status.st_size <= most else b""
+    if max(len(data), status.st_size) > most:
+        raise OSError(f"it has {max(len(data), status.st_size)} bytes, and may have {most}")
+    return data

@@ -1,0 +1,139 @@
+"""Which settings count in the key of which stage, by names that stay.
+
+The names and the released defaults stand here, and not only in the classes of :mod:`tract_dask.settings`: a class that
+is renamed or moved, and a new setting with its default, change no key. A released default is part of its stage's
+algorithm. Where it changes, change it here too, and raise the stage's number in
+:data:`tract_dask.store.provenance.ALGORITHMS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..settings.declare import Settings
+
+
+@dataclass(frozen=True)
+class Keyed:
+    """A setting that counts in a key.
+
+    Attributes
+    ----------
+    name
+        Its name in keys, for ever.
+    default
+        Its released default, which is in no key.
+    place
+        Where it is today, as ``group.field`` of :class:`tract_dask.settings.RunSettings`; empty: as its name says.
+    """
+
+    name: str
+    default: Any
+    place: str = ""
+
+    def value(self, groups: dict[str, Settings]) -> Any:
+        """Return the setting's value, as JSON has it."""
+        group, _, field = (self.place or self.name).partition(".")
+        return plain(getattr(groups[group], field))
+
+
+KEYED: dict[str, tuple[Keyed, ...]] = {
+    "convert": (
+        Keyed("source.raw_shape", None),
+        Keyed("source.raw_dtype", None),
+        Keyed("source.raw_offset", 0),
+        Keyed("convert.shard_mb", 256.0),
+        Keyed("convert.tile_px", 256),
+        Keyed("convert.codec", "lz4"),
+    ),
+    "drift": (Keyed("drift.method", "auto"), Keyed("drift.search_px", None)),
+    "sum": (),
+    "columns": (
+        Keyed("columns.method", "auto"),
+        Keyed("columns.contrast", "bright"),
+        Keyed("columns.lattices", ()),
+        Keyed("columns.spacing_px", None),
+        Keyed("columns.search_radius_px", None),
+        Keyed("columns.centroid_radius_px", None),
+        Keyed("columns.min_amplitude", 0.15),
+        Keyed("columns.detection_threshold", 5.0),
+        Keyed("columns.template", None),
+        Keyed("fit.window_px", None),
+        Keyed("fit.blur_sigma_px", 2.0),
+    ),
+    "fit": (
+        Keyed("fit.estimator", "lsq"),
+        Keyed("fit.shape", "fixed"),
+        Keyed("fit.filter", "gaussian"),
+        Keyed("fit.blur_sigma_px", 2.0),
+        Keyed("fit.wiener_background", 1.0),
+        Keyed("fit.wiener_cutoff", 0.3),
+        Keyed("fit.tv_fidelity", 0.9),
+        Keyed("fit.tv_iterations", 200),
+        Keyed("fit.mask_radius_px", None),
+        Keyed("fit.max_shift_px", None),
+        Keyed("fit.sigma_factor", 1.3),
+        Keyed("fit.amplitude_factor", 5.0),
+        Keyed("fit.threshold", 1.6),
+        Keyed("fit.counting", True),
+        Keyed("fit.intensity_scale", "paper"),
+        Keyed("fit.tolerance_px", 1e-4),
+        Keyed("fit.max_iterations", 50),
+    ),
+}
+"""The settings of each stage's key. The other settings count by what comes of them: :data:`OTHERWISE`."""
+
+OTHERWISE = {
+    "metadata.pixel_size_pm": "written down, in no key",
+    "metadata.frame_time_s": "written down, in no key",
+    "metadata.dose": "written down, in no key",
+    "metadata.gain": "the movie's gain is in the keys of sum and fit",
+    "drift.csv": "the file's contents are in the key of drift",
+    "drift.refine": "fewest columns that refine, or none, are in the key of fit",
+    "drift.refine_columns": "fewest columns that refine, or none, are in the key of fit",
+    "columns.csv": "the file's contents are in the key of columns",
+    "fit.window_px": "the window that is fitted is in the key of fit",
+    "fit.vacuum_box": "the box that is looked at is in the key of fit",
+}
+"""How settings count that are in no key by their own value, or in another stage's."""
+
+
+def counted(stage: str, **groups: Settings) -> dict[str, Any]:
+    """Return the settings of a stage's key that differ from their defaults, by name.
+
+    Parameters
+    ----------
+    groups
+        The groups of settings that hold them, named as in :class:`tract_dask.settings.RunSettings`.
+
+    Examples
+    --------
+    >>> from tract_dask.settings import DriftSettings
+    >>> counted("drift", drift=DriftSettings(search_px=12, refine=False))
+    {'drift.search_px': 12.0}
+    """
+    values = ((item, item.value(groups)) for item in KEYED[stage])
+    return {item.name: value for item, value in values if value != plain(item.default)}
+
+
+def default_of(stage: str, name: str) -> Any:
+    """Return the released default of a setting by its name in keys; None where there is no such name any more."""
+    return next((plain(item.default) for item in KEYED[stage] if item.name == name), None)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it, all numbers as floats: whether one is whole tells nothing apart.
+
+    Examples
+    --------
+    >>> plain(({"origin": (1, 2.5)}, True))
+    [{'origin': [1.0, 2.5]}, True]
+    """
+    if isinstance(value, dict):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    return value

@@ -1,0 +1,116 @@
+"""Where a store came from: fingerprints of inputs, keys of stages, versions and times."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from itertools import accumulate, groupby
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..settings.declare import Settings
+from ..settings.toml import to_toml
+from .keys import plain
+from .processor import processor
+
+ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
+"""The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
+
+A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds number,
+defaults and results of each stage together.
+"""
+
+WHOLE_BYTES = 32 << 20
+"""Files that hold no more than this together are read whole for their fingerprint."""
+
+_END_BYTES = 1 << 20
+_SAMPLES = 64
+_SAMPLE_BYTES = 1 << 16
+_FILE_BYTES = 1 << 14
+_GOLDEN = 0.6180339887498949
+
+Part: TypeAlias = str | bytes | int | float | bool | list[Any] | tuple[Any, ...] | dict[str, Any] | NDArray[Any] | None
+"""What a key can be made of."""
+
+
+def fingerprint(*paths: Path) -> str:
+    """Return a fingerprint of what files hold, whatever their names, folders and times.
+
+    Small movies are read whole. Of others, whose hash would cost as much as their conversion, these are read: the first
+    and the last megabyte of the first and the last file, 64 blocks of 64 KiB spread over all, and a block from the
+    middle of each file.
+    """
+    sizes = [path.stat().st_size for path in paths]
+    digest = hashlib.sha256(json.dumps(sizes).encode())
+    for number, blocks in groupby(_samples(sizes), key=lambda block: block[0]):
+        with paths[number].open("rb") as file:
+            for _, offset, count in blocks:
+                file.seek(offset)
+                digest.update(file.read(count))
+    return digest.hexdigest()
+
+
+def _samples(sizes: list[int]) -> Iterator[tuple[int, int, int]]:
+    """Yield the blocks that stand for files of these sizes, in order: number of the file, offset, bytes."""
+    if sum(sizes) <= WHOLE_BYTES:
+        yield from ((number, 0, size) for number, size in enumerate(sizes))
+        return
+    starts = [0, *accumulate(sizes)]
+    blocks = [(number, 0, _END_BYTES) for number in (0, len(sizes) - 1)]
+    blocks += [(number, max(0, sizes[number] - _END_BYTES), _END_BYTES) for number in (0, len(sizes) - 1)]
+    for k in range(_SAMPLES):  # one in each part of the whole, not at the same place of each: frames are alike there
+        place = int((k + k * _GOLDEN % 1) / _SAMPLES * starts[-1])
+        number = int(np.searchsorted(starts, place, side="right")) - 1
+        blocks.append((number, max(0, min(place - starts[number], sizes[number] - _SAMPLE_BYTES)), _SAMPLE_BYTES))
+    if len(sizes) > 1:
+        blocks += [(number, max(0, size - _FILE_BYTES) // 2, _FILE_BYTES) for number, size in enumerate(sizes)]
+    yield from sorted(set(blocks))
+
+
+def stage_key(stage: str, *parts: Part) -> str:
+    """Return the key of a stage's result: a hash of its algorithm's number, its settings and what it read.
+
+    Two results with the same key are the same; a stage is done when its store carries the key that it should have.
+    """
+    return digest_of(stage, ALGORITHMS[stage], *parts)
+
+
+def digest_of(*parts: Part) -> str:
+    """Return a hash of some values, the same on every machine; numbers count by their value, whole ones or not."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = b"".join(_bytes_of(part))
+        digest.update(len(data).to_bytes(8, "big") + data)
+    return digest.hexdigest()
+
+
+def _bytes_of(part: Part) -> Iterator[bytes]:
+    if isinstance(part, bytes):
+        yield part
+    elif isinstance(part, np.ndarray):
+        array = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
+        yield f"{array.dtype.str} {array.shape}".encode()
+        yield array.tobytes()
+    else:
+        yield json.dumps(plain(part), sort_keys=True).encode()
+
+
+def provenance(key: str, settings: Settings, source: str = "") -> dict[str, Any]:
+    """Return what every store carries about its making, ready to be stored as attributes."""
+    packages = ("tract_dask", "numpy", "numba", "zarr", "dask")
+    return {
+        "key": key,
+        "settings": to_toml(settings),
+        "source": source,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": processor(),
+        "versions": {"python": platform.python_version()}
+        | {name: importlib.metadata.version(name) for name in packages},
+    }

@@ -1,0 +1,331 @@
+"""results.zarr: create it, finish it, open it; and the mask of what can be trusted.
+
+The store is created whole before the first fit (columns, measured drift, times; everything else at its fill value), so
+that tasks need nothing but its path, and a viewer can open it while the fits still run. What is fitted lies in the
+journal's folder until all is done (:mod:`tract_dask.store.parts`); then it is joined into a few files a variable.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+
+from ..errors import MissingStoreError, SettingsError, StoreError
+from ..settings.run import FitSettings
+from ..settings.toml import from_toml
+from . import datasets, disk, files, metadata, schema
+from .journal import Journal, journal_beside
+from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
+from .schema import REJECTED, Status
+from .shard_files import CHUNK_KEYS, chunk_path, codecs
+
+CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose")
+"""What pixels and frames mean: attributes of the store, which any reader finds there."""
+
+FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
+"""The variables that :func:`accepted` masks."""
+
+_FILE_SHARDS = (8, 64)
+"""Shards of the movie whose fits share a file a variable: no fewer, unless there are no more; no more."""
+
+_FILE_BYTES = 128 << 20
+"""So large may such a file be, before compression."""
+
+_CHUNK_BYTES = 32 << 20
+"""Stored chunks are opened in groups, of so many bytes of ``fit``: small ones would be a task each."""
+
+
+def damage(path: Path) -> StoreError | None:
+    """Return what is wrong with what :func:`create` has written; None where it is sound.
+
+    Raises
+    ------
+    StoreError
+        Where it cannot be read.
+    """
+    try:
+        datasets.open_dataset(path, only=[name for name in metadata.nodes(path) if name not in SHARDED])
+    except StoreError as error:
+        if metadata.is_of_system(error):
+            raise
+        return error
+    return None
+
+
+def create(
+    path: Path,
+    columns: xr.Dataset,
+    drift: np.ndarray[Any, Any],
+    time: np.ndarray[Any, Any],
+    frames_per_shard: int,
+    **about: Any,
+) -> None:
+    """Create the store at ``path``, whole or not at all.
+
+    Parameters
+    ----------
+    columns
+        The columns in the summed image (:data:`schema.COLUMNS`).
+    drift, time
+        Measured drift (frame, axis) in px and start of each frame (frame) in s.
+    frames_per_shard
+        Frames in an inner chunk of every variable: those of a movie shard.
+    about
+        Attributes under :data:`stores.ATTRIBUTE`.
+    """
+    sizes = {"frame": len(time), "column_id": columns.sizes["column_id"]} | schema.SIZES
+    known = {"drift_measured": drift, "time": time}
+    static = columns.assign_coords(schema.coordinates(len(time)))
+    static = static.assign({name: (schema.RESULTS[name].dims, values) for name, values in known.items()})
+    static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
+    for name in (*known, *schema.COLUMNS):
+        static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
+    static.attrs = {name: about.get(name) for name in CALIBRATION}
+    static.attrs[metadata.ATTRIBUTE] = metadata.json_ready({**about, "complete": False})
+    aside = path.with_name(f".{path.name}.partial")
+    step = min(frames_per_shard, len(time))
+    per_file = _per_file(-(-len(time) // step), 8 * step * sizes["column_id"] * sizes["parameter"])
+    with files.disk_errors(path):
+        files.remove(aside)
+        datasets.write_arrays(static, aside)
+        group = zarr.open_group(aside, mode="a")
+        for variable in map(schema.RESULTS.__getitem__, SHARDED):
+            shape = tuple(sizes[dim] for dim in variable.dims)
+            group.create_array(
+                variable.name,
+                shape=shape,
+                chunks=(step, *shape[1:]),
+                shards=(step * per_file, *shape[1:]),
+                dtype=variable.dtype,
+                compressors=codecs(CODEC),
+                chunk_key_encoding=CHUNK_KEYS,
+                fill_value=variable.fill,
+                dimension_names=variable.dims,
+                attributes=variable.attributes,
+            )
+        metadata.seal(aside)
+        files.remove(path)
+        disk.place_folder(aside, path)
+
+
+def _per_file(n_shards: int, shard_bytes: int) -> int:
+    """Return the shards that share a file, where the largest variable has ``shard_bytes`` a shard.
+
+    Examples
+    --------
+    >>> _per_file(1000, 1000), _per_file(1000, 10 << 20), _per_file(1000, 1 << 30), _per_file(5, 1000)
+    (64, 12, 8, 5)
+    """
+    fewest, most = _FILE_SHARDS
+    return min(n_shards, max(fewest, min(most, _FILE_BYTES // shard_bytes)))
+
+
+def finish(path: Path, **about: Any) -> None:
+    """Say that the store is complete, once all files of its variables are on disk."""
+    with files.disk_errors(path):
+        disk.sync_folders(path)
+    metadata.update_attributes(path, complete=True, **about)
+
+
+def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
+    """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
+    if any(metadata.attributes(path).get(name) != value for name, value in about.items()):
+        datasets.overwrite_array(path / "time", time)
+        metadata.update_attributes(path, plain=about, **about)
+
+
+def finished_shards(path: Path) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return which shards of the store at ``path`` are done, (shards,); of a finished store, all.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there are no results.
+    """
+    parts = _parts(path)
+    if parts is not None:
+        return parts.done
+    n_frames, step, _ = layout(path)
+    return np.full(-(-n_frames // step), bool(metadata.attributes(path).get("complete")))
+
+
+def variables(path: Path) -> Callable[[str], Any]:
+    """Return what opens a variable of the store at ``path`` by its name, to be sliced along its frames.
+
+    Of a store whose fits are not all done it is at the fill value where they are not.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there are no results.
+    """
+    parts = _parts(path)
+
+    def opened(name: str) -> Any:
+        array = datasets.open_array(path / name)
+        return array if parts is None or name not in SHARDED else Growing(array, name, parts)
+
+    return opened
+
+
+def growing_files(path: Path) -> list[tuple[Path, Iterator[bytes]]]:
+    """Return the files that the finished shards of a store would make, and their bytes; none of a complete one."""
+    parts = _parts(path)
+    if parts is None:
+        return []
+    _, _, per_file = layout(path)
+    found = []
+    for number, start in enumerate(range(0, len(parts.done), per_file)):
+        shards = range(start, min(start + per_file, len(parts.done)))
+        if parts.done[shards].any():
+            for name in SHARDED:
+                file = chunk_path(path / name, number, *file_place(name))
+                found.append((file, joined(parts, name, shards, per_file)))
+    return found
+
+
+def stored_bytes(path: Path) -> int:
+    """Return about how many bytes the fits take on disk, those that are done."""
+    parts = _parts(path)
+    if parts is not None:
+        return sum((parts.run / name).stat().st_size for name in parts.files)
+    return sum(file.stat().st_size for name in SHARDED for file in (path / name).glob("c.*"))
+
+
+def _parts(path: Path) -> Parts | None:
+    """Return what is fitted of a store that is not complete; None where it is, or nothing is known of its fits."""
+    about = metadata.attributes(path)
+    if not (path / "fit").is_dir():
+        raise _nothing_here(path)
+    journal = None if about.get("complete") else Journal.existing(journal_beside(path), str(about.get("key")))
+    if journal is None:
+        return None
+    n_frames, step, _ = layout(path)
+    return Parts.of(journal, n_frames, step)
+
+
+def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
+    """Return the tracks at ``path`` as a lazy Dataset over (frame, column_id, parameter).
+
+    Parameters
+    ----------
+    path
+        A results.zarr.
+    unfinished
+        Also open a store whose fits are not all done; what is missing is NaN, flagged ``not_converged``.
+
+    Raises
+    ------
+    MissingStoreError
+        Where there are no results, they are unfinished, or another version of the package wrote them.
+    """
+    path = Path(path)
+    about = metadata.attributes(path)
+    if not (path / "fit").is_dir():
+        raise _nothing_here(path)
+    if not about.get("complete") and not unfinished:
+        raise MissingStoreError(
+            "the fits are not all done",
+            str(path),
+            remedy="Run the same command again to finish, or open it with unfinished=True",
+        )
+    stored = datasets.open_lazily(path, partial=not about.get("complete"))
+    if lacking := [name for name in (*schema.RESULTS, *schema.COLUMNS) if name not in stored]:
+        raise MissingStoreError(
+            "these results are of another version",
+            str(path),
+            "all variables of this version",
+            f"no {', '.join(lacking)}",
+            "Fit again with this version: the same tract-dask run, with --overwrite",
+        )
+    frames, *rest = stored["fit"].encoding["chunks"]
+    frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
+    dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
+    if not about.get("complete"):
+        dataset = _grown(dataset, path)
+    dataset.attrs |= {name: about.get(name) for name in CALIBRATION}
+    settings = from_toml(FitSettings, about["settings"], str(path))
+    dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
+    return dataset
+
+
+def _grown(dataset: xr.Dataset, path: Path) -> xr.Dataset:
+    """Return the Dataset of a store that is not complete, with what is fitted so far."""
+    import dask.array as da  # takes its time, and workers do not need it
+
+    opened = variables(path)
+    lazy = {
+        name: da.from_array(opened(name), chunks=dataset[name].data.chunksize, name=False, fancy=False)
+        for name in SHARDED
+    }
+    return dataset.assign({name: dataset[name].copy(data=values) for name, values in lazy.items()})
+
+
+def _nothing_here(path: Path) -> MissingStoreError:
+    return MissingStoreError(
+        "there are no results here", str(path), "a results.zarr", remedy="Make it with tract-dask run"
+    )
+
+
+def how_fitted(settings: FitSettings, window: int, reference_blur_px: float) -> dict[str, Any]:
+    """Return what an analysis needs to know of the fits, as attributes of their Dataset.
+
+    They are the window's diameter, sigma of the blur that the windows went through and of that of the summed image
+    (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, and the ``intensity_scale``.
+    """
+    return {
+        "window_px": window,
+        "window_blur_px": settings.window_blur_px,
+        "reference_blur_px": float(reference_blur_px),
+        "shape": settings.shape,
+        "estimator": settings.estimator,
+        "intensity_scale": settings.intensity_scale,
+    }
+
+
+def fitted_with(tracks: xr.Dataset, name: str) -> Any:
+    """Return one of the attributes that :func:`how_fitted` makes.
+
+    Raises
+    ------
+    SettingsError
+        Where the tracks have lost it.
+    """
+    if name not in tracks.attrs:
+        raise SettingsError(
+            "the tracks do not say how they were fitted",
+            f"tracks.attrs[{name!r}]",
+            "the attributes of tract_dask.open_results or fit_columns",
+            ", ".join(map(str, tracks.attrs)),
+            "Keep them through what you do with the tracks, for instance by xarray.set_options(keep_attrs=True)",
+        )
+    return tracks.attrs[name]
+
+
+def accepted(dataset: xr.Dataset, threshold: float | None = None) -> xr.Dataset:
+    """Return the Dataset with every untrusted fit masked: estimates, errors and intensities become NaN.
+
+    Parameters
+    ----------
+    dataset
+        Results, as :func:`open_results` gives them.
+    threshold
+        Smallest amplitude that is believed, in units of the frame's noise; None keeps that of the fit (the paper's 2).
+
+    Notes
+    -----
+    A fit is accepted where none of the flags in :data:`schema.REJECTED` is set. The paper's only condition is the one
+    on the amplitude (section 2.4).
+    """
+    status = dataset["status"]
+    if threshold is not None:
+        weak = ~(abs(dataset["fit"].sel(parameter="amplitude", drop=True)) > threshold * dataset["noise"])
+        status = (status & ~np.uint8(Status.BELOW_NOISE)) | (weak * np.uint8(Status.BELOW_NOISE))
+    good = (status & np.uint8(REJECTED)) == 0
+    return dataset.assign({name: dataset[name].where(good) for name in FITTED} | {"status": status})

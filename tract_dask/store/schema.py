@@ -1,0 +1,244 @@
+"""Every stored array, declared once: name, dimensions, dtype, unit, and a sentence that says what it is.
+
+Conventions: arrays are (frame, y, x); an integer coordinate is a pixel's centre, counted from 0; x to the right,
+y down.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..errors import SettingsError, StoreError
+from ..kernels.gaussian.parameters import PARAMETER_UNITS, PARAMETERS
+
+CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain")
+"""What a movie's numbers mean: size of a pixel, time of a frame, dose of a frame, counts for one detector unit."""
+
+
+AXES = ("y", "x")
+"""Labels of the ``axis`` dimension of a drift."""
+
+
+SIZES = {"parameter": len(PARAMETERS), "axis": len(AXES), "place": 16}
+"""Dimensions of the results that have one length always; a ``place`` is one in vacuum."""
+
+
+class Status(enum.IntFlag):
+    """What speaks against a fit; 0 where nothing does.
+
+    ``AT_BOUND`` is about position, amplitude and background. ``SHAPE_AT_BOUND`` is about the sigmas alone: the position
+    is then the best one for a column of that shape, and is accepted.
+    """
+
+    OK = 0
+    BELOW_NOISE = 1
+    NOT_CONVERGED = 2
+    AT_BOUND = 4
+    OUTSIDE_FRAME = 8
+    BAD_FRAME = 16
+    SHAPE_AT_BOUND = 32
+
+
+REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | Status.OUTSIDE_FRAME | Status.BAD_FRAME
+"""A fit with any of these flags is not accepted."""
+
+
+STATUS_ATTRIBUTES = {
+    "flag_masks": [int(flag) for flag in Status if flag],
+    "flag_meanings": " ".join(str(flag.name).lower() for flag in Status if flag),
+}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A stored array: what it is called, how it is laid out, and what it means."""
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    description: str
+    fill: Any = 0
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Attributes to store with the array (CF names)."""
+        attributes: dict[str, Any] = {"units": self.unit, "long_name": self.description}
+        return attributes | (STATUS_ATTRIBUTES if self.name == "status" else {})
+
+
+def _declare(*variables: Variable) -> dict[str, Variable]:
+    return {variable.name: variable for variable in variables}
+
+
+_FIT = ("frame", "column_id", "parameter")
+
+
+_COLUMN = ("frame", "column_id")
+
+
+_NAN = float("nan")
+
+
+RESULTS = _declare(
+    Variable("fit", _FIT, "float64", "mixed", "Estimates of Equation 1; x and y are drift-corrected", _NAN),
+    Variable(
+        "stderr",
+        _FIT,
+        "float64",
+        "mixed",
+        "Standard errors of the estimates, from the fit's covariance",
+        _NAN,
+    ),
+    Variable(
+        "centroid",
+        ("frame", "column_id", "axis"),
+        "float64",
+        "px",
+        "Centroid in a round mask that has moved onto the column; drift-corrected",
+        _NAN,
+    ),
+    Variable("intensity", _COLUMN, "float64", "counts", "Column intensity, Equation 3", _NAN),
+    Variable("intensity_error", _COLUMN, "float64", "counts", "Error of the intensity, Equation 5", _NAN),
+    Variable("intensity_stderr", _COLUMN, "float64", "counts", "Standard error of the intensity, from the fit", _NAN),
+    Variable("status", _COLUMN, "uint8", "1", "Flags that speak against a fit", int(Status.NOT_CONVERGED)),
+    Variable(
+        "presence",
+        _COLUMN,
+        "float32",
+        "1",
+        "Matched filter at the column's place: amplitude over its standard error where there is no column",
+        _NAN,
+    ),
+    Variable("presence_vacuum", ("frame", "place"), "float32", "1", "The same at places in vacuum", _NAN),
+    Variable("r_squared", _COLUMN, "float32", "1", "Share of the window's variance that the fit explains", _NAN),
+    Variable("n_iterations", _COLUMN, "int16", "1", "Iterations of the fit", 0),
+    Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
+    Variable("drift_measured", ("frame", "axis"), "float64", "px", "The same, before the columns refined it", _NAN),
+    Variable("noise", ("frame",), "float64", "counts", "Standard deviation in vacuum, after the filter", _NAN),
+    Variable(
+        "time",
+        ("frame",),
+        "float64",
+        "s",
+        "Start of the frame; frame number where no frame time is known",
+        _NAN,
+    ),
+)
+"""results.zarr: the tracks."""
+
+
+COLUMNS = _declare(
+    Variable("x_ref", ("column_id",), "float64", "px", "Position in the summed image", _NAN),
+    Variable("y_ref", ("column_id",), "float64", "px", "Position in the summed image", _NAN),
+    Variable("kind", ("column_id",), "str", "1", "Sublattice or element, free text", ""),
+    Variable("fit_ref", ("column_id", "parameter"), "float64", "mixed", "Fit on the summed image, per frame", _NAN),
+    Variable("status_ref", ("column_id",), "uint8", "1", "Flags of the fit on the summed image", 0),
+)
+"""The columns as found in the summed image; also part of results.zarr."""
+
+
+DRIFT = _declare(
+    Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
+    Variable(
+        "quality",
+        ("frame",),
+        "float64",
+        "1",
+        "Correlation of the shifted frame with the reference, 0 to 1",
+        _NAN,
+    ),
+)
+"""drift.zarr."""
+
+
+SUM = _declare(
+    Variable("image", ("y", "x"), "float64", "counts", "Drift-corrected mean of the frames, counts a frame", _NAN),
+    Variable("exposure", ("y", "x"), "uint32", "frames", "Frames that cover the pixel", 0),
+)
+"""sum.zarr: the summed image, divided by the frames that cover each pixel."""
+
+
+STATISTICS = _declare(
+    Variable("frame_min", ("t",), "float64", "detector units", "Smallest finite pixel of the frame", _NAN),
+    Variable("frame_max", ("t",), "float64", "detector units", "Largest finite pixel of the frame", _NAN),
+    Variable("frame_mean", ("t",), "float64", "detector units", "Mean of the frame's finite pixels", _NAN),
+    Variable(
+        "frame_std",
+        ("t",),
+        "float64",
+        "detector units",
+        "Standard deviation of the frame's finite pixels",
+        _NAN,
+    ),
+    Variable("frame_bad_pixels", ("t",), "int64", "px", "Pixels that are NaN or infinite", 0),
+)
+"""Per-frame statistics in movie.zarr."""
+
+
+def texts(values: Iterable[str]) -> np.ndarray[Any, Any]:
+    """Return strings as an array of objects: the only form of text that Zarr v3 stores by its specification."""
+    return np.array([str(value) for value in values], dtype=object)
+
+
+def coordinates(n_frames: int) -> dict[str, Any]:
+    """Return the coordinates that every results Dataset shares: frame, parameter (with its units) and axis."""
+    return {
+        "frame": np.arange(n_frames),
+        "parameter": ("parameter", texts(PARAMETERS)),
+        "unit": ("parameter", texts(PARAMETER_UNITS)),
+        "axis": ("axis", texts(AXES)),
+    }
+
+
+def validate(dataset: xr.Dataset, variables: dict[str, Variable], where: str) -> xr.Dataset:
+    """Return ``dataset`` if it holds every declared variable with its dimensions.
+
+    Raises
+    ------
+    StoreError
+        Naming the first variable that is missing or laid out differently.
+    """
+    for name, variable in variables.items():
+        if name not in dataset:
+            raise StoreError(
+                f"the Dataset has no {name!r}",
+                where,
+                f"variables {', '.join(variables)}",
+                ", ".join(map(str, dataset.variables)),
+                "Make it with the function that this stage offers",
+            )
+        if dataset[name].dims != variable.dims:
+            raise StoreError(
+                f"{name!r} is laid out differently",
+                where,
+                f"dimensions {variable.dims}",
+                f"{dataset[name].dims}",
+                "Transpose or rename its dimensions",
+            )
+    return dataset
+
+
+def drift_of(drift: xr.Dataset | None, n_frames: int) -> NDArray[np.float64]:
+    """Return the drift of every frame of a movie, (n_frames, 2) in px; zero where there is none.
+
+    Raises
+    ------
+    SettingsError
+        Where it is that of another movie.
+    """
+    if drift is None:
+        return np.zeros((n_frames, 2))
+    shift = validate(drift, DRIFT, "drift")["drift"].to_numpy().astype(np.float64)
+    if len(shift) != n_frames:
+        raise SettingsError(
+            "the drift is of another movie", "drift", f"{n_frames} frames", f"{len(shift)}", "Measure it on this one"
+        )
+    return shift
