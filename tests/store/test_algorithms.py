@@ -206,8 +206,10 @@ def test_number_defaults_and_results_of_a_stage_change_together(stage, results):
     found = {"defaults": defaults, "results": [float(f"{value:.5g}") for value in results[stage]]}
     told = (
         f"The defaults or the results of stage {stage} are not those of its algorithm {number}. If that is meant, raise"
-        f" ALGORITHMS[{stage!r}] in tract_dask/store/provenance.py to {max(map(int, golden), default=0) + 1}, change the"
-        f" defaults in tract_dask/store/keys.py too, and add this under that number to {GOLDEN.name}, where entries stay:\n"
+        f" ALGORITHMS[{stage!r}] in tract_dask/store/provenance.py to"
+        f" {max(map(int, golden), default=0) + 1}, change the"
+        f" defaults in tract_dask/store/keys.py too, and add this under that number to {GOLDEN.name},"
+        " where entries stay:\n"
         f"{json.dumps(found)}"
     )
     assert number in golden, told

@@ -9,7 +9,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import click
 
@@ -17,12 +17,11 @@ from ..errors import TractError, check_system
 from . import interrupts
 from .jobs import cancel, jobs, submit, watch
 from .options import Command
+from .results import compare_filters, export, figures, report, verify
+from .run import columns, convert, demo, drift, fit, inspect, run
 from .serve import certs, serve, token
-from .show import DEBUG
-
-if TYPE_CHECKING:
-    pass
-from .show import FAILED
+from .show import DEBUG, FAILED
+from .simulate import simulate
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -70,8 +69,11 @@ def main() -> None:
     """
 
 
-for service_command in (serve, token, certs, submit, jobs, watch, cancel):
-    main.add_command(service_command)
+_STAGES = (run, inspect, convert, drift, columns, fit)
+_RESULTS = (verify, compare_filters, demo, report, export, figures)
+_SERVICE = (serve, token, certs, submit, jobs, watch, cancel)
+for _command in (*_STAGES, *_RESULTS, simulate, *_SERVICE):
+    main.add_command(_command)
 
 
 @contextmanager
@@ -109,7 +111,3 @@ def command() -> NoReturn:
         with suppress(OSError, ValueError):  # whoever read it may be gone
             stream.flush()
     os._exit(code if isinstance(code, int) else int(code is not None))
-
-
-if __name__ == "__main__":
-    command()

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from ..settings.run import RunSettings
-from .options import numbers, setting_options
-from .show import PATH, common_options, show
-
-if TYPE_CHECKING:
-    pass
-from .main import main
+from .options import Command, numbers, setting_options
 from .run import get_ready
-from .show import FAILED, progress
+from .show import FAILED, PATH, common_options, progress, show
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("path", type=PATH, metavar="OUTPUT")
 @click.option("--repair", is_flag=True, help="Then make what is damaged in a movie anew, from its source.")
 @common_options
@@ -42,7 +37,7 @@ def verify(path: Path, *, repair: bool, as_json: bool) -> None:
         click.get_current_context().exit(FAILED)
 
 
-@main.command("compare-filters")
+@click.command("compare-filters", cls=Command)
 @click.argument("source")
 @click.argument("output", type=PATH)
 @click.option("--frames", type=numbers, default="0", metavar="N,N,...", help="Numbers of the frames [0].")
@@ -67,10 +62,13 @@ def compare_filters(
 
     run_folder = Path(source)
     if not (run_folder / "movie.zarr").is_dir():
-        run_folder, pipeline = output, get_ready(settings)
-        filters.check_frames(frames, pipeline.run(source, output, settings, plan_only=True).frames)
+        run_folder = output
+        get_ready(settings)
+        from ..run.pipeline import run
+
+        filters.check_frames(frames, run(source, output, settings, plan_only=True).frames)
         with progress() as on_event:
-            pipeline.run(source, output, settings, on_event=on_event)
+            run(source, output, settings, on_event=on_event)
     compared, warnings = compare_in_run(run_folder, output, frames, column_ids, settings.fit)
     if as_json:
         click.echo(json.dumps({"rows": list(filters.table_rows(compared)), "warnings": warnings}))
@@ -80,7 +78,7 @@ def compare_filters(
         click.echo(f"Warning: {warning}.", err=True)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("folder", type=PATH, metavar="OUTPUT")
 @click.option("--file", type=PATH, help="Where to write the report; otherwise report.html in the folder.")
 @common_options
@@ -95,7 +93,7 @@ def report(folder: Path, file: Path | None, *, as_json: bool) -> None:
     show({"wrote": str(written), "bytes": written.stat().st_size}, as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("results", type=PATH)
 @click.argument("file", type=PATH)
 @click.option("--overwrite", is_flag=True, help="Replace the file if it is there.")
@@ -127,7 +125,7 @@ def export(results: Path, file: Path, *, overwrite: bool, accepted_only: bool, a
     show({"wrote": str(file), "bytes": file.stat().st_size}, as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("out", type=PATH)
 @click.option("--folder", type=PATH, help='Where to put the figures. ["figures" in OUT].')
 @click.option("--only", metavar="NAME,NAME,...", help="Names of figures; unset: those that need no further fits.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,19 +11,18 @@ import click
 from ..cluster.forkserver import uncollected
 from ..progress import STAGES
 from ..settings.run import RunSettings
-from .options import setting_options
+from .options import Command, setting_options
 from .show import PATH, common_options, show
 
 if TYPE_CHECKING:
     from ..run.pipeline import RunOutcome
     from ..run.plan import Plan
-from .main import main
 from .show import exit_for, overwrite_option, progress
 
 drift_option = click.option("--drift-from", type=PATH, help="The drift, as tract-dask drift wrote it; otherwise none.")
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("source")
 @click.argument("output", type=PATH)
 @click.option("--plan", "plan_only", is_flag=True, help="Print what would be done, and stop.")
@@ -38,13 +36,15 @@ def run(source: str, output: Path, settings: RunSettings, *, as_json: bool, **op
 
     Run it again to go on where it was stopped; changed settings redo only what they affect.
     """
-    pipeline = get_ready(settings)
+    get_ready(settings)
+    from ..run.pipeline import run as run_stages
+
     with progress() as on_event:
-        outcome = pipeline.run(source, output, settings, on_event=on_event, **options)
+        outcome = run_stages(source, output, settings, on_event=on_event, **options)
     _show_outcome(outcome, as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("path")
 @common_options
 @setting_options("source", "metadata")
@@ -58,7 +58,7 @@ def inspect(path: str, settings: RunSettings, *, as_json: bool) -> None:
     show(describe(path, settings), as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("source")
 @click.argument("destination", type=PATH)
 @overwrite_option
@@ -66,26 +66,30 @@ def inspect(path: str, settings: RunSettings, *, as_json: bool) -> None:
 @setting_options("source", "metadata", "convert", "cluster")
 def convert(source: str, destination: Path, settings: RunSettings, *, overwrite: bool, as_json: bool) -> None:
     """Convert the movie SOURCE to the store DESTINATION (.zarr)."""
-    pipeline = get_ready(settings)
+    get_ready(settings)
+    from ..run.one_stage import run_convert
+
     with progress() as on_event:
-        one_stage.run_convert(source, destination, settings, on_event=on_event, overwrite=overwrite)
+        run_convert(source, destination, settings, on_event=on_event, overwrite=overwrite)
     _show_store(destination, as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("movie", type=PATH)
 @click.argument("output", type=PATH)
 @common_options
 @setting_options("drift", "cluster")
 def drift(movie: Path, output: Path, settings: RunSettings, *, as_json: bool) -> None:
     """Measure the drift of the store MOVIE into OUTPUT (.zarr)."""
-    pipeline = get_ready(settings)
+    get_ready(settings)
+    from ..run.one_stage import run_drift
+
     with progress() as on_event:
-        one_stage.run_drift(movie, output, settings, on_event=on_event)
+        run_drift(movie, output, settings, on_event=on_event)
     _show_store(output, as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("movie", type=PATH)
 @click.argument("output", type=PATH)
 @click.option("--edit", is_flag=True, help="Then edit them in the browser; what is saved there is written to OUTPUT.")
@@ -107,15 +111,17 @@ def columns(
 
     They are looked for in the movie's drift-corrected sum; a figure of them is written beside the table.
     """
-    pipeline = get_ready(settings)
+    get_ready(settings)
+    from ..run.one_stage import run_columns
+
     with progress() as on_event:
-        one_stage.run_columns(movie, output, settings, drift_from, on_event=on_event, overwrite=overwrite)
+        run_columns(movie, output, settings, drift_from, on_event=on_event, overwrite=overwrite)
         if edit and _edit(output, settings):
-            one_stage.run_columns(movie, output, settings, drift_from, on_event=on_event)
+            run_columns(movie, output, settings, drift_from, on_event=on_event)
     _show_store(output.with_suffix(".zarr"), as_json=as_json)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("movie", type=PATH)
 @click.argument("columns", type=PATH)
 @click.argument("results", type=PATH)
@@ -129,14 +135,16 @@ def fit(
 
     MOVIE and RESULTS are stores (.zarr); what RESULTS has from an interrupted fit is kept.
     """
-    pipeline = get_ready(settings)
+    get_ready(settings)
+    from ..run.one_stage import run_fit
+
     with progress() as on_event:
-        summary = one_stage.run_fit(movie, columns, results, settings, drift_from, on_event=on_event)
+        summary = run_fit(movie, columns, results, settings, drift_from, on_event=on_event)
     _show_store(results, as_json=as_json)
     exit_for(summary.bad_frames)
 
 
-@main.command()
+@click.command(cls=Command)
 @click.argument("folder", type=PATH, default="tract-dask-demo")
 @click.option("--frames", default=60, show_default=True, help="Frames of the simulated movie.")
 @common_options
@@ -164,15 +172,14 @@ def _edit(table: Path, settings: RunSettings) -> bool:
     )
 
 
-def get_ready(settings: RunSettings) -> ModuleType:
-    """Import the pipeline; the server of the local workers, if there are to be any, imports at the same time."""
+def get_ready(settings: RunSettings) -> None:
+    """Import what runs; the server of the local workers, if there are to be any, imports at the same time."""
     from ..cluster import forkserver
 
     if not (settings.cluster.scheduler or settings.cluster.scheduler_file):
         forkserver.start()
     with uncollected():
-        from ..run import pipeline
-    return pipeline
+        from ..run import one_stage  # noqa: F401
 
 
 def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:

@@ -81,5 +81,6 @@ def progress() -> Iterator[Sink]:
 
 
 def exit_for(bad_frames: int) -> None:
+    """End with the exit code for frames that could not be fitted, if there are any."""
     if bad_frames:
         click.get_current_context().exit(BAD_FRAMES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -12,10 +12,6 @@ from ..settings.run import RunSettings
 from ..simulate.settings import PRESETS, Microscope, SpecimenSettings
 from .options import class_options, setting_options
 from .show import PATH, Subgroup, common_options, show
-
-if TYPE_CHECKING:
-    pass
-from .main import main
 
 pixel_option = click.option("--pixel-size-pm", default=4.0, show_default=True, metavar="PM", help="Size of a pixel.")
 
@@ -26,7 +22,7 @@ specimen_options = class_options(SpecimenSettings, "specimen", "Specimen")
 microscope_options = class_options(Microscope, "microscope", "Microscope", presets=PRESETS)
 
 
-@main.group(cls=Subgroup)
+@click.group(cls=Subgroup)
 def simulate() -> None:
     """Simulate movies, images and look-up tables with known truth.
 

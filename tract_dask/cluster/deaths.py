@@ -1,7 +1,8 @@
 """How workers died: their nannies note it on the scheduler, and whoever lost work there asks.
 
-A nanny notes the deaths of its worker where it has loaded this module (``--preload-nanny tract_dask.cluster.deaths``), as those
-of clusters that are started here do, or once a client has registered :class:`NoteDeaths`.
+A nanny notes the deaths of its worker where it has loaded this module (``--preload-nanny
+tract_dask.cluster.deaths``), as those of clusters that are started here do, or once a client has registered
+:class:`NoteDeaths`.
 """
 
 from __future__ import annotations

@@ -11,11 +11,9 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
-from typing import Any
 
 AVAILABLE = sys.platform == "linux" and sys.version_info >= (3, 11, 1)
 """Elsewhere workers are spawned: Windows cannot fork, and on macOS system libraries do not survive it.
@@ -50,7 +48,7 @@ Dask's own limit for that, 64 KiB, makes the system clear the pages of every buf
 """
 
 
-_PRELOAD = [f"{__package__}.preload"]
+_PRELOAD = ["tract_dask.run.worker_imports"]
 
 
 def start() -> None:
@@ -88,34 +86,6 @@ def _environment() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-def lazy_names(package: str, homes: dict[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return the ``__getattr__`` and ``__dir__`` of a package.
-
-    Parameters
-    ----------
-    package
-        Its ``__name__``.
-    homes
-        The module inside the package that holds each name.
-
-    Examples
-    --------
-    >>> find, names = lazy_names("tract_dask", {"open_movie": "movie"})
-    >>> find("open_movie").__module__
-    'tract_dask.store.movie'
-    """
-
-    def find(name: str) -> Any:
-        if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f".{homes[name]}", package), name)
-
-    def names() -> list[str]:
-        return sorted([*vars(sys.modules[package]), *homes])
-
-    return find, names
 
 
 @contextmanager

@@ -99,7 +99,8 @@ def stream_shards(
     Raises
     ------
     TractError
-        The first error of a task that does not pass (:mod:`tract_dask.cluster.tries`); finished shards stay in the journal.
+        The first error of a task that does not pass (:mod:`tract_dask.cluster.tries`); finished shards stay in the
+        journal.
     StoreError
         Where shards crash the workers that work on them, where a shard is not on disk though it was written, or where
         another run has taken the place of this one.

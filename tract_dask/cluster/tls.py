@@ -56,7 +56,7 @@ def using(credentials: Credentials | None) -> Iterator[None]:
 
 
 def security(folder: str | None) -> Security | None:
-    """Return what Dask needs to encrypt with the certificates in ``folder`` (:mod:`tract_dask.cluster.certificates`), or None.
+    """Return what Dask needs to encrypt with the certificates in ``folder``, or None; see :mod:`.certificates`.
 
     Both ends of every connection have to show a certificate that ``ca.pem`` has signed; nothing unencrypted is spoken.
 

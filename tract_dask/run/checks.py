@@ -158,6 +158,7 @@ def open_input(
 
 
 def check_suffix(path: Path, suffix: str) -> None:
+    """Check that the name of a file ends as it has to."""
     if path.suffix != suffix:
         raise DestinationError(
             "the name does not fit", str(path), f"a name that ends in {suffix}", path.name, "Change it"
@@ -180,6 +181,7 @@ def with_whole_paths(settings: RunSettings) -> RunSettings:
 
 
 def check_stage(until: str | None) -> None:
+    """Check that there is a stage of this name."""
     if until is not None and until not in STAGES:
         raise InputError("there is no such stage", "until", f"one of {', '.join(STAGES)}", until, "Correct its name")
 

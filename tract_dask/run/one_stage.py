@@ -34,6 +34,7 @@ from .checks import (
     open_input,
     with_whole_paths,
 )
+from .columns_picture import draw_columns
 from .pipeline import refine_columns_of
 from .plan import plan_run
 from .session import Session
@@ -95,7 +96,8 @@ def run_columns(
     with Session(str(movie), path, settings.cluster, client, on_event) as session:
         attempt, send = session.attempt, session.send
         summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), session.workers, send))
-        return attempt(partial(columns_stage, summed, path, settings.columns, settings.fit, send, overwrite=overwrite))
+        find = partial(columns_stage, summed, path, settings.columns, settings.fit, send, draw=draw_columns)
+        return attempt(partial(find, overwrite=overwrite))
 
 
 def run_fit(
@@ -121,6 +123,6 @@ def run_fit(
         attempt, workers, send = session.attempt, session.workers, session.send
         summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), workers, send))
         csv = path.with_name(f"{path.stem}_columns.csv")
-        found = attempt(partial(columns_stage, summed, csv, chosen, settings.fit, send))
+        found = attempt(partial(columns_stage, summed, csv, chosen, settings.fit, send, draw=draw_columns))
         refine = refine_columns_of(settings)
         return attempt(partial(fit_stage, opened, found, shift, summed, path, settings.fit, refine, workers, send))

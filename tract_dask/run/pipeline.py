@@ -48,6 +48,7 @@ from .checks import (
     open_input,
     with_whole_paths,
 )
+from .columns_picture import draw_columns
 from .plan import Plan, expected_limit, plan_run
 from .session import Record, Session
 
@@ -224,8 +225,12 @@ def _stages(
     summed = attempt(partial(sum_stage, movie, drift, outputs.sum, workers, send))
     yield "sum"
     session.finish_aside()  # it imports what comes next: two threads could meet in packages that import each other
-    found = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send, aside=session.aside)
-    made.columns = columns = attempt(found)
+
+    def draw(image: xr.Dataset, found: xr.Dataset, figure: Path) -> None:
+        session.aside(partial(draw_columns, image, found, figure))
+
+    find = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send, draw=draw)
+    made.columns = columns = attempt(find)
     yield "columns"
     refine = refine_columns_of(settings)
     made.summary = attempt(
@@ -257,6 +262,7 @@ def _report(outputs: RunFolder, session: Session) -> None:
 
 
 def refine_columns_of(settings: RunSettings) -> int | None:
+    """Return how many columns refine the drift; None where it is not refined."""
     return settings.drift.refine_columns if settings.drift.refine and settings.drift.method != "none" else None
 
 

@@ -116,6 +116,7 @@ class Record:
         self.reused: tuple[str, ...] = ()
 
     def __call__(self, event: Event) -> None:
+        """Take an event."""
         if isinstance(event, StageDone):
             if event.reused:
                 self.reused += (event.stage,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import httpcore  # noqa: F401  httpx would import it with its first client, which two threads may make at once
 import httpx
@@ -14,10 +14,6 @@ from .. import errors
 from ..errors import ClusterError, InputError, ServiceError, TractError
 from ..settings.run import RunSettings
 from ..settings.toml import to_dict
-
-if TYPE_CHECKING:
-    pass
-
 
 _COME_BACK = (502, 503, 504)
 

@@ -163,4 +163,5 @@ def _check_text(where: str, meta: Mapping[str, Any], texts: Iterable[Any]) -> No
 
 
 def contradiction(name: str, expected: str, got: str, remedy: str) -> SettingsError:
+    """Return the error for settings that contradict each other."""
     return SettingsError("settings contradict each other", f"setting {name} (ClusterSettings)", expected, got, remedy)

@@ -23,17 +23,8 @@ Workers = Callable[[], Client]
 """Gives the client; connects at its first call (:class:`tract_dask.cluster.connect.LazyClient`)."""
 
 
-Aside = Callable[[Callable[[], object]], object]
-"""Takes work that nothing waits for but the end of the run."""
-
-
 _ATTEMPTS = 3
 """So often a stage is gone through whose tasks left what is damaged then."""
-
-
-def at_once(work: Callable[[], object]) -> object:
-    """Do the work now."""
-    return work()
 
 
 def kept(
@@ -80,6 +71,7 @@ def _made(make: Callable[[], xr.Dataset], on_event: Sink) -> xr.Dataset:
 
 
 def save(dataset: xr.Dataset, path: Path, key: str, settings: Settings, kind: str, **more: Any) -> None:
+    """Write the result of a stage with its provenance."""
     about = provenance(key, settings) | {"kind": kind, "complete": True} | more
     known = {name: value for name, value in dataset.attrs.items() if value is not None}
     stored = dataset.copy()
@@ -88,6 +80,7 @@ def save(dataset: xr.Dataset, path: Path, key: str, settings: Settings, kind: st
 
 
 def is_done(path: Path, key: str) -> bool:
+    """Tell whether the store at ``path`` is complete and has this key."""
     about = metadata.attributes(path)
     return about.get("key") == key and bool(about.get("complete"))
 

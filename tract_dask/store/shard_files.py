@@ -151,9 +151,9 @@ def decode(data: memoryview, out: Pixels, *, encoded: bool) -> None:
 class ShardWriter:
     """Writes one shard, frame by frame: aside first; in its place once the block of the ``with`` statement is over.
 
-    In an open batch (:func:`tract_dask.store.disk.together`) it is there once that is committed. Neither a killed task nor a
-    second copy of it can leave a shard that is half written. Frames are laid into the tiles of the current layer, which
-    are encoded once the layer is full, or the movie ends.
+    In an open batch (:func:`tract_dask.store.disk.together`) it is there once that is committed. Neither a killed task
+    nor a second copy of it can leave a shard that is half written. Frames are laid into the tiles of the current
+    layer, which are encoded once the layer is full, or the movie ends.
 
     Parameters
     ----------

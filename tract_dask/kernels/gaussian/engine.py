@@ -367,9 +367,9 @@ def _compiled(sources: str) -> Any:
     return enter, iterate, find_errors, leave
 
 
-_SOURCES = ("simd", "tracing", "moments", "steps", "iteration", "covariance", "engine")
+_SOURCES = ("../vectors/simd", "../vectors/tracing", "moments", "steps", "iteration", "covariance", "engine")
 _enter, _iterate, _find_errors, _leave = _compiled(
-    hashlib.sha256(b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in _SOURCES)).hexdigest()
+    hashlib.sha256(b"".join((Path(__file__).parent / f"{name}.py").read_bytes() for name in _SOURCES)).hexdigest()
 )
 
 

@@ -56,7 +56,8 @@ class Job:
     attempts
         How often it has been started.
     progress, outcome
-        As :class:`tract_dask.service.runner.timeline.Timeline` and :class:`tract_dask.run.pipeline.RunOutcome` tell them.
+        As :class:`tract_dask.service.runner.timeline.Timeline` and :class:`tract_dask.run.pipeline.RunOutcome` tell
+        them.
     columns_version
         Of the columns that are fitted; 0: those found automatically; None: nobody has chosen.
     not_before

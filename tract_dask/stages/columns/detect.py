@@ -1,9 +1,10 @@
 """Detection: what stands out of the noise like a column, in the summed image, or frame by frame.
 
-Unlike :func:`tract_dask.stages.columns.lattice.find_peaks` these methods know nothing of a lattice. Each makes of the image a map of
-strengths, in units of what white noise alone shows there, of which the local maxima are taken:
+Unlike :func:`tract_dask.stages.columns.lattice.find_peaks` these methods know nothing of a lattice. Each makes of the
+image a map of strengths, in units of what white noise alone shows there, of which the local maxima are taken:
 
-- ``maxima``: the height above the surroundings after a blur of the columns' size (:func:`tract_dask.stages.columns.lattice.relief`);
+- ``maxima``: the height above the surroundings after a blur of the columns' size
+  (:func:`tract_dask.stages.columns.lattice.relief`);
 - ``blobs``: the negative Laplacian of a Gaussian at several scales, of each pixel the highest (Lindeberg, Int. J.
   Comput. Vis. 30 (1998) 79);
 - ``template``: the correlation coefficient r with the picture of a column (Lewis 1995, as in

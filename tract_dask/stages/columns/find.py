@@ -83,7 +83,8 @@ def find_columns(
 ) -> xr.Dataset:
     """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
 
-    Seeds come from the image (method ``auto``, see :func:`tract_dask.stages.columns.lattice.find_peaks`), from lattices of three atoms
+    Seeds come from the image (method ``auto``, see
+    :func:`tract_dask.stages.columns.lattice.find_peaks`), from lattices of three atoms
     (``lattice``, see :func:`lattice_columns`), from a file (``csv``), or are what stands out of the noise (``maxima``,
     ``blobs``, ``template``, see :mod:`tract_dask.stages.columns.detect`). Each moves to the local maximum within the
     search radius, then to the centroid around that, and there Equation 1 is fitted.

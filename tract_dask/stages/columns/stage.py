@@ -17,14 +17,16 @@ import xarray as xr
 
 from ...errors import DestinationError
 from ...progress import Sink, StageDone, StageStarted, Warned, silent
-from ...run.columns_picture import draw_columns
 from ...settings.run import ColumnSettings, FitSettings
 from ...store import datasets, files, metadata
 from ...store.columns import check_inside, read_columns_csv, write_columns_csv
 from ...store.keys import counted
 from ...store.provenance import stage_key
 from ...store.schema import Status
-from ..keep import Aside, at_once, content, save
+from ..keep import content, save
+
+Draw = Callable[[xr.Dataset, xr.Dataset, Path], object]
+"""Draws summed image and columns into a file, at once or in the background."""
 
 _OUR_TABLE = b"column_id,x,y,kind,"
 """How a table begins that a run has written."""
@@ -38,13 +40,13 @@ def columns_stage(
     on_event: Sink = silent,
     *,
     overwrite: bool = False,
-    aside: Aside = at_once,
+    draw: Draw,
 ) -> xr.Dataset:
     """Return the columns of a summed image, kept as the table ``csv``, with ``.zarr`` and ``.png`` of the same name.
 
     Where the table was edited by hand since, its columns are refined and returned instead, and the table is left
     as it is, whatever other setting changes; only another method or file of columns takes its place, after it was put
-    away. The figure is drawn by ``aside``.
+    away. The figure is drawn by ``draw``.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def columns_stage(
     if not csv.exists():
         files.write_aside(csv, table)
     figure.unlink(missing_ok=True)  # it is of other columns
-    aside(partial(draw_columns, summed, found.copy(), figure))
+    draw(summed, found.copy(), figure)
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
     return found
 

@@ -103,4 +103,5 @@ def finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sour
 
 
 def quantities(metadata: SourceMetadata | MetadataSettings) -> dict[str, Any]:
+    """Return pixel size, frame time, dose and gain by their names."""
     return {name: getattr(metadata, name) for name in schema.CALIBRATION}

@@ -66,6 +66,7 @@ def origin_of(source: FrameSource) -> Origin:
 
 
 def content_of(source: FrameSource) -> str:
+    """Return a hash of what a source holds."""
     if isinstance(source, GoneSource):
         return source.content
     return digest_of(source.inside, fingerprint(*source.files))

@@ -86,6 +86,7 @@ _MEMORY = 16
 
 
 def drift_dataset(drift: Floats, quality: Floats, movie: Movie, **attributes: Any) -> xr.Dataset:
+    """Return the drift (frame, axis) and its quality (frame,) as a Dataset."""
     variables = {"drift": drift, "quality": quality}
     return xr.Dataset(
         {name: (schema.DRIFT[name].dims, values, schema.DRIFT[name].attributes) for name, values in variables.items()},
@@ -165,6 +166,7 @@ class Track:
 def measure_drift(
     movie: Movie, settings: DriftSettings, client: Client | None, on_event: Sink, folder: Path | None
 ) -> xr.Dataset:
+    """Measure the drift of a movie; ``folder`` is the journal's."""
     level = _choose_level(movie, settings)
     shards = _parts(movie)
     with StageRun("drift", movie, on_event, folder, client, len(PASSES)) as stage:

@@ -179,4 +179,5 @@ def _reference(columns: xr.Dataset, blur_sigma_px: float, settings: FitSettings)
 
 
 def calibration(movie: Movie) -> dict[str, float | None]:
+    """Return what is known of a movie's units."""
     return {"pixel_size_pm": movie.pixel_size_pm, "frame_time_s": movie.frame_time_s, "dose": movie.dose}

@@ -1,0 +1,17 @@
+from .columns import plot_columns as plot_columns
+from .columns import plot_sum as plot_sum
+from .drift import plot_drift as plot_drift
+from .filters import plot_filters as plot_filters
+from .fit import plot_fit as plot_fit
+from .intensity import plot_intensity as plot_intensity
+from .intensity import plot_intensity_against_dose as plot_intensity_against_dose
+from .intensity import plot_repeated_error as plot_repeated_error
+from .motion import plot_displacement as plot_displacement
+from .motion import plot_jumps as plot_jumps
+from .motion import plot_tracks as plot_tracks
+from .occupancy import plot_look_up as plot_look_up
+from .occupancy import plot_occupancy as plot_occupancy
+from .precision import plot_fwhm as plot_fwhm
+from .precision import plot_precision as plot_precision
+from .precision import plot_spread as plot_spread
+from .presence import plot_presence as plot_presence

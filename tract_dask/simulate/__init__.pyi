@@ -1,0 +1,16 @@
+from .movie import simulate_movie as simulate_movie
+from .multislice import multislice_image as multislice_image
+from .multislice import thickness_series as thickness_series
+from .pictured import simulate_multislice_movie as simulate_multislice_movie
+from .settings import PRESETS as PRESETS
+from .settings import Microscope as Microscope
+from .settings import SpecimenSettings as SpecimenSettings
+from .shipped import ceo2_image as ceo2_image
+from .shipped import ceo2_table as ceo2_table
+from .structures import Specimen as Specimen
+from .structures import as_it_is as as_it_is
+from .structures import block as block
+from .structures import ceria_slab as ceria_slab
+from .structures import ceria_step as ceria_step
+from .structures import specimen_of as specimen_of
+from .table import tabulate as tabulate
