@@ -1,177 +1,240 @@
-"""Who may import whom: the table of the design. An edge that is not in it fails."""
+"""The law of the house: which room imports from which. The tables hold the imports that are used, and no others."""
 
 import ast
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "tract_dask"
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "tract_dask"
 
-GROUND = {"errors", "settings", "schema", "progress"}
-STORES = GROUND | {"damage", "disk", "journal", "keyed", "provenance", "shards", "stamps", "stores"}
-MOVIE = STORES | {"io", "movie", "kernels", "pixel_range", "processor"}
-STAGES = MOVIE | {"conversion", "layout", "drift", "summing", "columns", "fit", "results", "plots", "seeds", "windows"}
-RUN = STAGES | {"cluster", "dispatch", "inputs", "stages", "pipeline", "tasks", "tls"}
-
-ALLOWED = {
-    "errors": set(),
-    "lazy": set(),
-    "system": {"errors"},
-    "progress": set(),
-    "small_files": set(),
-    "locks": {"errors", "small_files"},
-    "schema": {"errors"},
-    "settings": {"errors"},
-    "keyed": {"settings"},
-    "processor": {"kernels"},
-    "provenance": {"keyed", "processor", "settings"},
-    "stamps": {"errors"},
-    "disk": set(),
-    "stores": {"damage", "disk", "errors", "schema", "shard_files"},
-    "damage": {"errors", "small_files"},
-    "shards": set(),
-    "journal": {"disk", "errors", "shard_files", "shards", "stores"},
-    "tries": {"errors", "progress"},
-    "deaths": set(),
-    "dispatch": {"deaths", "errors", "journal", "shards", "tries"},
-    "tasks": {"dispatch", "errors", "journal", "progress", "shards", "tries"},
-    "kernels": set(),
-    "io": STORES,
-    "shard_files": {"disk"},
-    "layout": {"settings", "kernels", "shard_files"},
-    "ome": {"damage", "schema", "stores"},
-    "movie": STORES | {"kernels", "ome", "shard_files"},
-    "conversion": STORES | {"io", "kernels", "layout", "ome", "shard_files", "tasks"},
-    "passes": STORES | {"movie", "shard_files", "tasks"},
-    "lattice": {"kernels"},
-    "seeds": GROUND | {"small_files"},
-    "windows": {"errors"},
-    "vacuum": GROUND | {"kernels"},
-    "pixel_range": {"errors"},
-    "filtering": MOVIE,
-    "measure": MOVIE | {"filtering"},
-    "parts": STORES | {"shard_files", "tasks"},
-    "results": STORES | {"parts", "shard_files"},
-    "plots": MOVIE | {"analysis", "lazy", "results", "seeds"},
-    "drift": MOVIE | {"passes", "small_files"},
-    "summing": MOVIE | {"passes"},
-    "detection": MOVIE | {"lattice", "passes", "seeds", "windows"},
-    "columns": MOVIE | {"detection", "lattice", "seeds", "windows"},
-    "fit": MOVIE | {"measure", "parts", "results", "tasks", "vacuum", "windows"},
-    "comparison": MOVIE | {"filtering", "fit", "measure", "plots"},
-    "dose": MOVIE | {"fit", "shard_files"},
-    "analysis": MOVIE | {"columns", "measure", "results", "seeds", "vacuum", "windows"},
-    "export": GROUND | {"analysis", "results", "stores"},
-    "figures": MOVIE | {"analysis", "comparison", "dose", "plots", "results"},
-    "simulate": GROUND | {"analysis", "kernels", "lazy", "seeds", "stores", "windows"},
-    "tls": {"certificates", "errors"},
-    "slurm": {"deaths", "errors", "forkserver", "settings", "tls"},
-    "supervision": set(),
-    "ssh": {"deaths", "errors", "forkserver", "settings", "supervision", "tls"},
-    "dask_dashboard": set(),
-    "cluster": {"dask_dashboard", "deaths", "dispatch", "errors", "settings", "forkserver", "slurm", "ssh", "tls"},
-    "forkserver": set(),
-    "preload": {"kernels", "lazy", "stages"},
-    "stages": STAGES | {"passes"},
-    "faults": {"damage"},
-    "beside": GROUND | {"faults", "keyed", "seeds", "small_files", "stores"},
-    "verify": STORES | {"beside", "conversion", "faults", "locks", "ome", "parts", "shard_files"},
-    "web": set(),
-    "report": MOVIE | {"analysis", "plots", "results", "small_files", "web", "windows"},
-    "inputs": STAGES | {"cluster", "vacuum"},
-    "pipeline": STAGES | {"cluster", "inputs", "locks", "report", "stages", "tls", "tries"},
-    "describe": RUN,
-    "demo": RUN | {"simulate"},
-    "editor": RUN | {"service"},
-    "options": {"settings"},
-    "console": {"options"},
-    "interrupts": set(),
-    "program": {"cli", "interrupts"},
-    "certificates": {"errors"},
-    "service": RUN
-    | {"parts", "analysis", "certificates", "deaths", "describe", "export", "forkserver", "lazy", "locks"}
-    | {"meter", "report", "shard_files", "small_files", "supervision", "terminal", "tries", "web"},
-    "client": {"errors", "results", "service", "settings"},
-    "remote": {"client", "console", "errors", "options", "progress", "settings", "terminal"},
-    "hosting": {"certificates", "console", "lazy", "options", "service", "settings"},
-    "meter": {"progress"},
-    "terminal": {"meter", "progress"},
-    "cli": RUN
-    | {"comparison", "demo", "describe", "export", "figures", "forkserver"}
-    | {"console", "editor", "hosting", "interrupts", "lazy", "options", "remote", "report", "simulate", "system"}
-    | {"terminal", "verify"},
+ALLOWED: dict[str, list[str]] = {
+    "errors": [],
+    "progress": [],
+    "kernels": [],
+    "web": [],
+    "settings": ["errors"],
+    "store": ["errors", "kernels", "settings"],
+    "readers": ["errors", "settings"],
+    "cluster": ["errors", "progress", "settings", "store"],
+    "stages": ["errors", "progress", "kernels", "settings", "store", "readers", "cluster"],
+    "analysis": ["errors", "kernels", "settings", "store", "stages"],
+    "plots": ["errors", "kernels", "settings", "store", "analysis"],
+    "export": ["errors", "kernels", "store", "analysis"],
+    "simulate": ["errors", "kernels", "settings", "store", "stages", "analysis"],
+    "report": ["errors", "kernels", "web", "settings", "store", "stages", "analysis", "plots"],
+    "run": [
+        "errors",
+        "progress",
+        "kernels",
+        "settings",
+        "store",
+        "readers",
+        "cluster",
+        "stages",
+        "analysis",
+        "plots",
+        "simulate",
+        "report",
+    ],
+    "service": [
+        "errors",
+        "progress",
+        "kernels",
+        "web",
+        "settings",
+        "store",
+        "readers",
+        "cluster",
+        "stages",
+        "analysis",
+        "export",
+        "run",
+    ],
+    "cli": [
+        "errors",
+        "progress",
+        "settings",
+        "cluster",
+        "analysis",
+        "plots",
+        "export",
+        "simulate",
+        "report",
+        "run",
+        "service",
+    ],
 }
-"""What each room (a file or a folder of the package) may import from the others."""
+"""What each room imports from the others; they stand from left to right, and a room imports only from its left."""
+
+INSIDE: dict[str, dict[str, list[str]]] = {
+    "kernels": {
+        "vectors": [],
+        "blur": ["vectors"],
+        "gaussian": ["vectors", "blur"],
+        "centroids": ["vectors"],
+        "presence": ["vectors", "blur", "gaussian"],
+        "sums": [],
+        "registration": ["sums"],
+        "alignment": ["registration"],
+        "magnitude": [],
+        "wiener": ["magnitude"],
+        "binning": [],
+        "changepoints": [],
+        "peaks": [],
+        "rendering": [],
+        "total_variation": [],
+    },
+    "service": {
+        "data_root": [],
+        "crashes": [],
+        "client_answers": [],
+        "jobs": ["data_root"],
+        "config": ["data_root"],
+        "process_pool": ["crashes"],
+        "errors": ["data_root", "crashes", "jobs"],
+        "outputs": ["data_root", "errors"],
+        "checks": ["data_root", "jobs", "outputs"],
+        "deletion": ["data_root", "jobs", "outputs"],
+        "events": ["jobs"],
+        "views": ["process_pool"],
+        "client": ["client_answers", "jobs"],
+        "auth": ["jobs", "config", "errors"],
+        "metrics": ["jobs", "events"],
+        "runner": ["data_root", "crashes", "jobs", "config", "outputs", "checks"],
+        "pages": ["errors", "auth"],
+        "error_handlers": ["jobs", "errors", "pages"],
+        "api": ["data_root", "jobs", "errors", "checks", "deletion", "events", "views", "auth"],
+        "app": [
+            "jobs",
+            "config",
+            "process_pool",
+            "events",
+            "views",
+            "auth",
+            "metrics",
+            "runner",
+            "pages",
+            "error_handlers",
+            "api",
+        ],
+        "notebook": ["data_root", "jobs", "config", "auth", "pages", "error_handlers", "api"],
+        "server": ["data_root", "jobs", "config", "events", "auth", "app"],
+    },
+}
+"""The same for what lies inside the two largest rooms."""
 
 ABROAD = {"numpy", "numba", "llvmlite"}
 """What kernels may import from outside, beside the standard library."""
 
-
-def room_of(file: Path) -> str:
-    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
-
-
-def imports(source: str, depth: int) -> tuple[set[str], set[str]]:
-    """Rooms of the package, and packages from outside, that a module imports; it lies ``depth`` folders down."""
-    rooms, outside = set(), set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ImportFrom) and node.level > depth:
-            rooms |= {node.module.split(".")[0]} if node.module else {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            first, *rest = node.module.split(".")
-            if first == PACKAGE.name:
-                rooms |= {rest[0]} if rest else {alias.name for alias in node.names}
-            else:
-                outside.add(first)
-        elif isinstance(node, ast.Import):
-            names = [alias.name.split(".") for alias in node.names]
-            rooms |= {name[1] for name in names if name[0] == PACKAGE.name and len(name) > 1}
-            outside |= {name[0] for name in names if name[0] != PACKAGE.name}
-    return rooms, outside
-
-
 FILES = sorted(file for file in PACKAGE.rglob("*.py") if file != PACKAGE / "__init__.py")
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
-def test_imports_point_downwards(file):
-    room = room_of(file)
-    rooms, _ = imports(file.read_text(encoding="utf-8"), len(file.relative_to(PACKAGE).parts) - 1)
-    assert room in ALLOWED, f"{room} is new: say in the table what it may import"
-    assert rooms - {room} <= ALLOWED[room]
+def module_of(file: Path) -> tuple[str, ...]:
+    """The names that lead to a module of the package, without the package's own."""
+    parts = file.relative_to(PACKAGE).with_suffix("").parts
+    return parts[:-1] if parts[-1] == "__init__" else parts
 
 
-@pytest.mark.parametrize("file", sorted((PACKAGE / "kernels").glob("*.py")), ids=lambda file: file.name)
-def test_kernels_know_only_numpy_and_numba(file):
-    _, outside = imports(file.read_text(encoding="utf-8"), 1)
-    assert outside - set(sys.stdlib_module_names) <= ABROAD
+MODULES = {module_of(file): file for file in FILES}
 
 
-def test_the_table_has_no_cycles():
-    def below(room: str, path: tuple[str, ...] = ()) -> None:
-        assert room not in path, f"a cycle: {' -> '.join((*path, room))}"
-        for other in ALLOWED[room]:
-            below(other, (*path, room))
+def imported(source: str, folder: tuple[str, ...]) -> tuple[set[tuple[str, ...]], set[str]]:
+    """Modules of the package, and packages from outside, that a module in ``folder`` imports anywhere."""
+    inside, outside = set(), set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            names = (node.module or "").split(".") if node.module else []
+            if not node.level and names[0] != PACKAGE.name:
+                outside.add(names[0])
+                continue
+            base = (*folder[: len(folder) - node.level + 1], *names) if node.level else tuple(names[1:])
+            parts = [(*base, alias.name) for alias in node.names]
+            inside |= {part if part in MODULES or not base else base for part in parts}
+        elif isinstance(node, ast.Import):
+            found = [alias.name.split(".") for alias in node.names]
+            inside |= {tuple(name[1:]) for name in found if name[0] == PACKAGE.name and len(name) > 1}
+            outside |= {name[0] for name in found if name[0] != PACKAGE.name}
+    return inside, outside
 
-    for room in ALLOWED:
-        below(room)
+
+def _folder(file: Path) -> tuple[str, ...]:
+    return file.relative_to(PACKAGE).parts[:-1]
 
 
-def test_every_room_of_the_table_is_there():
-    assert set(ALLOWED) == {room_of(file) for file in FILES}
+def graph() -> dict[tuple[str, ...], set[tuple[str, ...]]]:
+    """What each module imports of the package."""
+    return {name: imported(file.read_text(encoding="utf-8"), _folder(file))[0] for name, file in MODULES.items()}
+
+
+def between(rooms: tuple[str, ...] = ()) -> dict[str, set[str]]:
+    """What the rooms inside the room ``rooms`` import from each other; all of the package by default."""
+    depth, found = len(rooms), defaultdict(set)
+    for name, others in graph().items():
+        if name[:depth] == rooms and len(name) > depth:
+            inside = {other[depth] for other in others if other[:depth] == rooms and len(other) > depth}
+            found[name[depth]] |= inside - {name[depth]}
+    return found
 
 
 @pytest.mark.parametrize(
-    ("source", "depth", "rooms", "outside"),
+    ("rooms", "table"), [((), ALLOWED), *(((room,), table) for room, table in INSIDE.items())], ids=["house", *INSIDE]
+)
+def test_rooms_import_what_the_table_says(rooms, table):
+    order = list(table)
+    assert {room: sorted(others) for room, others in between(rooms).items()} == {
+        room: sorted(others) for room, others in table.items()
+    }
+    for room, others in table.items():
+        assert all(order.index(other) < order.index(room) for other in others), f"{room} imports from its right"
+
+
+def test_no_modules_import_each_other():
+    below, path = graph(), []
+
+    def visit(module: tuple[str, ...], seen: set[tuple[str, ...]]) -> None:
+        assert module not in path, " -> ".join(".".join(name) for name in (*path, module))
+        if module not in seen:
+            path.append(module)
+            for other in below.get(module, ()):
+                visit(other, seen)
+            path.pop()
+            seen.add(module)
+
+    seen: set[tuple[str, ...]] = set()
+    for module in below:
+        visit(module, seen)
+
+
+@pytest.mark.parametrize("file", sorted((PACKAGE / "kernels").rglob("*.py")), ids=lambda file: file.name)
+def test_kernels_know_only_numpy_and_numba(file):
+    _, outside = imported(file.read_text(encoding="utf-8"), _folder(file))
+    assert outside - set(sys.stdlib_module_names) <= ABROAD
+
+
+def test_the_architecture_page_shows_the_table():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = [f"| `{room}` | {', '.join(f'`{other}`' for other in others) or '–'} |" for room, others in ALLOWED.items()]
+    assert "\n".join(rows) in page
+
+
+@pytest.mark.parametrize(
+    ("source", "folder", "inside", "outside"),
     [
-        ("from . import stores, schema", 0, {"stores", "schema"}, set()),
-        ("from .io import open_source\nimport numpy.linalg", 0, {"io"}, {"numpy"}),
-        ("from .source import Source\nfrom ..errors import TractError", 1, {"errors"}, set()),
-        ("from .. import fit", 1, {"fit"}, set()),
-        ("import tract_dask.cli.main\nfrom tract_dask.store.movie import Movie", 0, {"cli", "movie"}, set()),
-        ("def f():\n    from .pipeline import run", 0, {"pipeline"}, set()),
+        ("from . import journal, schema", ("store",), {("store", "journal"), ("store", "schema")}, set()),
+        ("from .store.movie import Movie\nimport numpy.linalg", (), {("store", "movie")}, {"numpy"}),
+        (
+            "from .source import Source\nfrom ..errors import A",
+            ("readers",),
+            {("readers", "source"), ("errors",)},
+            set(),
+        ),
+        ("from .. import settings", ("store",), {("settings",)}, set()),
+        ("import tract_dask.cli\nfrom tract_dask.store.movie import Movie", (), {("cli",), ("store", "movie")}, set()),
+        ("def f():\n    from ..run.pipeline import run", ("cli",), {("run", "pipeline")}, set()),
     ],
 )
-def test_every_form_of_import_is_seen(source, depth, rooms, outside):
-    assert imports(source, depth) == (rooms, outside)
+def test_every_form_of_import_is_seen(source, folder, inside, outside):
+    assert imported(source, folder) == (inside, outside)

@@ -23,8 +23,8 @@ from .processor import processor
 ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
 """The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
 
-A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds number,
-defaults and results of each stage together.
+A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds
+number, defaults and results of each stage together.
 """
 
 WHOLE_BYTES = 32 << 20

@@ -24,7 +24,6 @@ from ...store.provenance import provenance, stage_key
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done
-from . import stage as fit
 from .job import Job, calibration, frame_times, load_job, prepare
 from .join import join
 from .measure import measure
@@ -167,8 +166,8 @@ def fit_stage(
     refine_columns: int | None,
     workers: Workers,
     on_event: Sink = silent,
-) -> fit.FitSummary:
+) -> FitSummary:
     """Fit every column in every frame into ``path``."""
     job = prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
-    client = None if is_done(path, fit.fit_key(movie, columns, job)) else workers()
-    return fit.fit_movie(movie, columns, job, path, client=client, on_event=on_event)
+    client = None if is_done(path, fit_key(movie, columns, job)) else workers()
+    return fit_movie(movie, columns, job, path, client=client, on_event=on_event)
