@@ -10,7 +10,14 @@ from conftest import Scene
 from matplotlib.figure import Figure
 
 from tract_dask import compare_filters, convert, filter_frames, fit_columns, open_movie
-from tract_dask.analysis.filters import FILTERS, filtered_region, table_rows, table_text, wiener_shifts, write_table
+from tract_dask.analysis.filters import (
+    FILTERS,
+    filtered_region,
+    table_rows,
+    table_text,
+    wiener_shifts,
+    write_comparison,
+)
 from tract_dask.cli import main as cli
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.blur import blur
@@ -77,7 +84,7 @@ def test_the_warning_names_the_column_and_how_far(compared):
 
 
 def test_the_table_holds_differences_from_the_unfiltered_frame(compared, tmp_path):
-    write_table(compared, tmp_path / "filters.csv")
+    write_comparison(compared, tmp_path / "filters.csv")
     with (tmp_path / "filters.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * len(FILTERS) * compared.sizes["column_id"] == len(list(table_rows(compared)))

@@ -14,6 +14,7 @@ import xarray as xr
 from ..errors import SettingsError
 from ..kernels.gaussian.parameters import X, Y
 from ..settings.run import FitSettings
+from ..stages.fit.common_motion import CERTAIN
 from ..stages.fit.filters import filter_frame
 from ..stages.fit.job import prepare
 from ..stages.fit.measure import Values, measure_frame
@@ -38,10 +39,6 @@ TABLE = (
     "intensity_difference",
 )
 """The columns of the table, as in the paper; positions in px of the frame, intensities in counts and per cent."""
-
-
-_CERTAIN = 13.8
-"""Chi-squared of two degrees of freedom at 99.9 %."""
 
 
 _MARGIN = 0.75
@@ -153,7 +150,7 @@ def wiener_shifts(compared: xr.Dataset) -> list[str]:
     errors = np.sqrt(((shift / np.stack([blurred[f"{axis}_stderr"] for axis in ("x", "y")])) ** 2).sum(axis=0))
     distance = np.hypot(*shift)
     pixel_size = compared.attrs.get("pixel_size_pm")
-    certain = errors**2 > _CERTAIN
+    certain = errors**2 > CERTAIN
     said = []
     for column in np.flatnonzero(certain.any(axis=0)).tolist():
         frame = int(np.argmax(np.where(certain[:, column], errors[:, column], 0)))
@@ -191,7 +188,7 @@ def table_text(compared: xr.Dataset) -> str:
     return "\n".join(lines)
 
 
-def write_table(compared: xr.Dataset, path: Path) -> None:
+def write_comparison(compared: xr.Dataset, path: Path) -> None:
     """Write the table as CSV."""
     with files.disk_errors(path), path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, TABLE)

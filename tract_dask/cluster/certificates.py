@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import DestinationError, InputError
+from ..store import disk
 
 CA, CA_KEY = "ca.pem", "ca-key.pem"
 SERVICE, SERVICE_KEY = "service.pem", "service-key.pem"
@@ -319,7 +320,7 @@ def _write(path: Path, certificate: x509.Certificate, key: ec.EllipticCurvePriva
     """Write the key, then the certificate, each aside and then renamed; a key is never readable by others."""
     public = certificate.public_bytes(serialization.Encoding.PEM)
     for place, data, mode in ((_key_path(path), _key_text(key), 0o600), (path, public, 0o644)):
-        aside = place.with_name(f".{place.name}.{os.getpid()}.partial")
+        aside = disk.aside(place, os.getpid())
         with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
         aside.replace(place)

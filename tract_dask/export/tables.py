@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from ..errors import DestinationError, InputError, SettingsError
 from ..kernels.gaussian import parameters
-from ..store import files, metadata, results, schema
+from ..store import disk, files, metadata, results, schema
+from ..store.run_folder import RunFolder
 from ..store.schema import REJECTED
 
 Floats = NDArray[np.float64]
@@ -86,7 +87,7 @@ def open_tracks(source: str | Path | xr.Dataset) -> xr.Dataset:
     """Return the Dataset of a results.zarr, or of the folder of a run that holds one."""
     if isinstance(source, xr.Dataset):
         return source
-    inside = Path(source) / "results.zarr"
+    inside = RunFolder(Path(source)).results
     return results.open_results(inside if inside.exists() else source)
 
 
@@ -303,7 +304,7 @@ def written_aside(path: Path, *, overwrite: bool) -> Iterator[Path]:
     if path.is_dir():
         raise DestinationError("a folder has this name", str(path), "a file", "a folder", "Choose another name")
     metadata.check_destination(path, overwrite=overwrite)
-    aside = path.with_name(f".{path.name}.partial{path.suffix}")
+    aside = disk.aside(path, suffix=path.suffix)
     try:
         with files.disk_errors(path):
             yield aside

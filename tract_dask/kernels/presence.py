@@ -24,12 +24,11 @@ from numpy.typing import NDArray
 
 from .blur import gaussian_kernel
 from .gaussian.model import blurred, evaluate
+from .gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from .vectors.simd import load, load_at, store, vector
 from .vectors.tracing import LANES
 
 Array = NDArray[Any]
-
-AMPLITUDE, X, Y, _, _, _, BACKGROUND = range(7)
 
 
 class Filters(NamedTuple):

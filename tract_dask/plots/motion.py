@@ -52,7 +52,7 @@ from .base import (
     write_ids,
 )
 
-_CERTAIN = 0.05
+_SIGNIFICANT = 0.05
 """Displacements are drawn as certain where chance makes as much with a probability below this."""
 _MARGIN = 0.6
 """Of a region beyond its outermost columns, in units of their spacing."""
@@ -165,8 +165,11 @@ def _arrows(
     longest = float(distance[known].max()) if known.any() else 1.0
     factor = 0.55 * spacing / max(longest, 1e-9)  # px of the figure for a pm
     axes.plot(*places.T, "o", color="#888888", ms=2.5)
-    for certain, colour, label in ((False, "#a8a8a8", f"p ≥ {_CERTAIN:g}"), (True, LINES[1], f"p < {_CERTAIN:g}")):
-        some = known & ((p_value < _CERTAIN) == certain)
+    for certain, colour, label in (
+        (False, "#a8a8a8", f"p ≥ {_SIGNIFICANT:g}"),
+        (True, LINES[1], f"p < {_SIGNIFICANT:g}"),
+    ):
+        some = known & ((p_value < _SIGNIFICANT) == certain)
         _quiver(axes, places[some], factor * step[some], colour, label=label)
     if len(places) <= _WRITTEN:
         for place, length, (_, down) in zip(places[known], distance[known], step[known], strict=True):

@@ -27,6 +27,7 @@ from ..settings.toml import from_toml
 from ..store import datasets, metadata
 from ..store.movie import Movie, open_movie
 from ..store.results import open_results
+from ..store.run_folder import RunFolder
 
 _GROUPS = (1, 2, 4)
 """Frames in a sum, for figures against dose."""
@@ -56,37 +57,42 @@ class Run:
     folder: Path
     table: Path | None = None
 
+    @property
+    def places(self) -> RunFolder:
+        """Where its stores are."""
+        return RunFolder(self.folder)
+
     @cached_property
     def tracks(self) -> xr.Dataset:
         """The results."""
-        return open_results(self.folder / "results.zarr")
+        return open_results(self.places.results)
 
     @cached_property
     def summed(self) -> xr.Dataset:
         """The summed image."""
-        summed = datasets.open_dataset(self.folder / "sum.zarr")
+        summed = datasets.open_dataset(self.places.sum)
         return summed.assign_attrs(pixel_size_pm=self.tracks.attrs["pixel_size_pm"])
 
     @cached_property
     def columns(self) -> xr.Dataset:
         """The columns as they were found."""
-        return datasets.open_dataset(self.folder / "columns.zarr")
+        return datasets.open_dataset(self.places.columns_store)
 
     @cached_property
     def movie(self) -> Movie:
         """The movie."""
-        return open_movie(self.folder / "movie.zarr")
+        return open_movie(self.places.movie)
 
     @cached_property
     def settings(self) -> FitSettings:
         """Those of the fit."""
-        path = self.folder / "results.zarr"
+        path = self.places.results
         return from_toml(FitSettings, metadata.attributes(path)["settings"], str(path))
 
     @cached_property
     def vacuum(self) -> xr.Dataset:
         """The level of the vacuum in the summed image."""
-        box = metadata.attributes(self.folder / "results.zarr").get("vacuum")
+        box = metadata.attributes(self.places.results).get("vacuum")
         return vacuum_level(self.summed, box and tuple(box), columns=self.columns)
 
     @cached_property
@@ -104,7 +110,7 @@ class Run:
     @cached_property
     def doses(self) -> list[xr.Dataset]:
         """The columns fitted in sums of 1, 2, 4 frames, in memory."""
-        drift = datasets.open_dataset(self.folder / "drift.zarr")
+        drift = datasets.open_dataset(self.places.drift)
         fits = fit_doses(self.movie, self.columns, drift, _GROUPS, self.settings, summed=self.summed)
         return [one.compute() for one in fits]
 
@@ -145,7 +151,7 @@ class Run:
 
 def _filters(run: Run, path: Path) -> Figure:
     frame = run.frames[1]
-    drift = datasets.open_dataset(run.folder / "drift.zarr")
+    drift = datasets.open_dataset(run.places.drift)
     compared = compare_filters(
         run.movie, run.columns, drift, frames=(frame,), column_ids=run.neighbours, settings=run.settings
     )

@@ -16,7 +16,7 @@ from ..settings.run import SourceSettings
 from .blocks import BlockSource
 from .source import Frames, Source, checked_claim, checked_dtype, checked_shape, truncated, widened, words
 from .tiff_codecs import CODECS, PART_BYTES, check_codestreams
-from .tiff_metadata import Description, describe
+from .tiff_metadata import Description, parse_description
 from .tiff_pages import Page, walk
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it warns of is an error here, with a remedy
@@ -72,7 +72,7 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings) -> Source:
             "the movie has no frames", str(path), "at least one page", "none", "Check how it was exported"
         )
     _check_first(pages[0], path)
-    description = describe(tags, path, len(pages))
+    description = parse_description(tags, path, len(pages))
     if description.order is not None and len(pages) >= len(description.order):
         pages = _ordered(pages, description.order, path)
     _check_alike(pages, path)

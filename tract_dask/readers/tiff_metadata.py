@@ -42,7 +42,7 @@ class Description:
     metadata: SourceMetadata = NOTHING_KNOWN
 
 
-def describe(tags: Tags, path: Path, n_pages: int) -> Description:
+def parse_description(tags: Tags, path: Path, n_pages: int) -> Description:
     """Return what the first page's tags say about the movie, whose file has ``n_pages``.
 
     Raises

@@ -25,6 +25,7 @@ from ..settings.run import RunSettings
 from ..store import files, metadata
 from ..store.files import read_small
 from ..store.provenance import digest_of
+from ..store.run_folder import RunFolder
 from ..web import bundle
 from ..web.bundle import STATIC
 from . import interactive
@@ -79,8 +80,8 @@ def write_report(folder: str | Path, path: str | Path | None = None, *, figures:
         Where the folder has no finished tracks or no summed image, or the file cannot be written.
     """
     folder = Path(folder)
-    place = folder / "report.html" if path is None else Path(path)
-    run = survey(folder, _events(folder / "events.jsonl"))
+    place = RunFolder(folder).report if path is None else Path(path)
+    run = survey(folder, _events(RunFolder(folder).events))
     files.write_aside(place, render(run, _key(folder), figures=figures).encode(errors="backslashreplace"))
     return place
 
@@ -88,7 +89,7 @@ def write_report(folder: str | Path, path: str | Path | None = None, *, figures:
 def is_current(folder: Path) -> bool:
     """Tell whether the folder's report is of the tracks that are in it now."""
     try:
-        with (folder / "report.html").open(encoding="utf-8") as file:
+        with RunFolder(folder).report.open(encoding="utf-8") as file:
             return f"{KEY}{_key(folder)}" in file.read(2000)
     except OSError:
         return False
@@ -96,8 +97,8 @@ def is_current(folder: Path) -> bool:
 
 def _key(folder: Path) -> str:
     """Return the key of a report: all that the tracks say of themselves, and the settings of the run."""
-    about = json.dumps(metadata.attributes(folder / "results.zarr"), sort_keys=True)
-    settings = folder / "run.toml"
+    about = json.dumps(metadata.attributes(RunFolder(folder).results), sort_keys=True)
+    settings = RunFolder(folder).settings
     return digest_of(about, settings.read_bytes() if settings.exists() else b"")
 
 

@@ -20,6 +20,7 @@ from ..kernels.gaussian.parameters import AMPLITUDE, X, Y
 from ..settings.run import RunSettings
 from ..settings.toml import load
 from ..store import datasets, metadata, results, schema
+from ..store.run_folder import RunFolder
 from ..store.schema import Status
 
 VALUES = 1_600_000
@@ -98,23 +99,24 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     StoreError
         Where the tracks or the summed image are missing or unfinished.
     """
-    tracks = results.open_results(folder / "results.zarr")
+    places = RunFolder(folder)
+    tracks = results.open_results(places.results)
     if tracks.nbytes <= _IN_MEMORY:
         tracks = tracks.load(scheduler="threads")
-    summed = datasets.open_dataset(folder / "sum.zarr")
-    about = metadata.attributes(folder / "results.zarr")
+    summed = datasets.open_dataset(places.sum)
+    about = metadata.attributes(places.results)
     scale = tracks.attrs.get("pixel_size_pm")
     measured = tracks if scale else tracks.assign_attrs(pixel_size_pm=1.0)  # lengths are then in px
     lazy = column_numbers(measured), frame_numbers(tracks), column_series(measured)
     columns, frames, series = dask.compute(*lazy, scheduler="threads", optimize_graph=False)  # else dask loses keys
-    if (folder / "drift.zarr").exists():
-        frames["quality"] = ("frame", datasets.open_dataset(folder / "drift.zarr")["quality"].to_numpy())
+    if places.drift.exists():
+        frames["quality"] = ("frame", datasets.open_dataset(places.drift)["quality"].to_numpy())
     columns["residual"] = ("column_id", residuals(tracks, summed)[0])
     return Survey(
         folder=folder,
         tracks=measured,
-        about=about | {"movie": metadata.attributes(folder / "movie.zarr")},
-        settings=_settings(folder / "run.toml"),
+        about=about | {"movie": metadata.attributes(places.movie)},
+        settings=_settings(places.settings),
         unit="pm" if scale else "px",
         scale=scale or 1.0,
         columns=columns,

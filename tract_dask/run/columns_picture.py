@@ -6,11 +6,13 @@ from pathlib import Path
 
 import xarray as xr
 
+from ..store import disk
+
 
 def draw_columns(summed: xr.Dataset, columns: xr.Dataset, figure: Path) -> None:
     """Draw the columns beside the place of their figure, then put them there, so that a figure is always whole."""
     from ..plots.columns import plot_columns  # matplotlib takes its time, and not every run draws
 
-    partial_figure = figure.with_name(f".{figure.stem}.partial{figure.suffix}")
+    partial_figure = disk.aside(figure, suffix=figure.suffix)
     plot_columns(summed, columns, partial_figure)
     partial_figure.replace(figure)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from ..analysis.filters import compare_filters, filtered_region, wiener_shifts, write_table
+from ..analysis.filters import compare_filters, filtered_region, wiener_shifts, write_comparison
 from ..errors import MissingStoreError
 from ..settings.run import FitSettings
 from ..store import datasets
@@ -46,6 +46,6 @@ def compare_in_run(
     movie, drift, columns = open_movie(stage["movie"]), *(datasets.open_dataset(stage[k]) for k in ("drift", "columns"))
     compared = compare_filters(movie, columns, drift, frames=frames, column_ids=column_ids, settings=settings)
     output.mkdir(parents=True, exist_ok=True)
-    write_table(compared, output / "filters.csv")
+    write_comparison(compared, output / "filters.csv")
     plot_filters(filtered_region(movie, compared, frames[0], settings), compared, output / "filters.png")
     return compared, wiener_shifts(compared)

@@ -16,9 +16,8 @@ from ..settings.run import RunSettings
 from ..store import datasets, metadata
 from ..store.movie import open_movie
 from ..store.results import open_results
+from ..store.run_folder import STORES, RunFolder
 from ..store.schema import Status
-
-_STORES = ("movie.zarr", "drift.zarr", "sum.zarr", "columns.zarr", "results.zarr")
 
 
 def describe(path: str | Path, settings: RunSettings | None = None) -> dict[str, Any]:
@@ -30,8 +29,8 @@ def describe(path: str | Path, settings: RunSettings | None = None) -> dict[str,
         Where it is neither a store, nor the folder of a run, nor a movie.
     """
     place = Path(path)
-    if (place / "run.toml").exists():
-        return {"run": str(place)} | {name: _state(place / name) for name in _STORES}
+    if RunFolder(place).settings.exists():
+        return {"run": str(place)} | {name: _state(place / name) for name in STORES}
     about = metadata.attributes(place)
     if not about:
         return _source(str(path), settings or RunSettings())

@@ -196,7 +196,7 @@ def _bytes_per_s(store: JobStore, root: DataRoot) -> float:
         if not seconds.keys() >= _WHOLE:
             continue  # some of it had been done before
         with suppress(TractError, OSError):
-            movie = open_movie(root.resolve(job.output) / "movie.zarr")
+            movie = open_movie(RunFolder(root.resolve(job.output)).movie)
             rates.append(_raw_bytes(movie.shape, movie.dtype.name) / max(sum(seconds.values()), 1e-3))
     return median(rates) if rates else BYTES_PER_S
 

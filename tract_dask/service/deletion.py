@@ -15,6 +15,7 @@ from pathlib import Path
 
 from ..errors import TractError
 from ..store import files, metadata
+from ..store.disk import PARTIAL
 from ..store.journal import journal_beside
 from ..store.locks import lock_files, sole_use
 from ..store.run_folder import RunFolder
@@ -25,7 +26,7 @@ from .outputs import GOING, LOCK, MARK, Mark, read_mark, signature, write_mark
 
 _log = logging.getLogger(__name__)
 
-_OF_A_STORE = re.compile(r"zarr\.json|c?[\d.]+|c(\.\d+)*|.*\.partial")
+_OF_A_STORE = re.compile(rf"zarr\.json|c?[\d.]+|c(\.\d+)*|.*{re.escape(PARTIAL)}")
 """Names of the files that a run writes into its stores."""
 
 
@@ -91,7 +92,7 @@ def _delete(place: Path, mark: Mark) -> str:
         if path.name not in changed:
             _clear(journal_beside(path))  # first: as long as the store is there, this is not forgotten
             _remove(path)
-    for aside in (*place.glob(".*.partial"), *place.glob(".*.removed")):
+    for aside in (*place.glob(f".*{PARTIAL}"), *place.glob(".*.removed")):
         _clear(aside)
     for file in () if changed else (place / MARK, *lock_files(place / LOCK)):
         file.unlink(missing_ok=True)

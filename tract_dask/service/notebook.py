@@ -90,7 +90,7 @@ def edit_columns(
     """
     if isinstance(summed, str | Path):
         place = Path(summed)
-        outputs = RunFolder(place if (place / "sum.zarr").exists() else place.parent)
+        outputs = RunFolder(place if RunFolder(place).sum.exists() else place.parent)
         is_run = place == outputs.root
         if is_run and columns is None and outputs.columns.is_file():
             columns = outputs.columns

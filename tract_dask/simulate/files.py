@@ -103,7 +103,7 @@ def write_simulated_table(
     _check_suffix(path, ".csv")
     series = thickness_series(specimen_of(specimen, even=True), microscope, pixel_size_pm=pixel_size_pm)
     table = tabulate(series, settings, kind=kind, contrast=contrast)
-    return table, write_table(table, series, path, specimen)
+    return table, write_series(table, series, path, specimen)
 
 
 def write_image(simulated: xr.Dataset, path: Path, specimen: SpecimenSettings) -> list[Path]:
@@ -151,7 +151,7 @@ def write_image(simulated: xr.Dataset, path: Path, specimen: SpecimenSettings) -
     )
 
 
-def write_table(table: xr.Dataset, series: xr.Dataset, path: Path, specimen: SpecimenSettings) -> list[Path]:
+def write_series(table: xr.Dataset, series: xr.Dataset, path: Path, specimen: SpecimenSettings) -> list[Path]:
     """Write a look-up table as CSV, the images it was measured in (``.tif``) and its settings (``.toml``).
 
     Raises as :func:`write_image`.

@@ -17,6 +17,7 @@ import xarray as xr
 
 from ..errors import DestinationError, SettingsError
 from ..kernels.rendering import PoissonTable, draw_counts, poisson_table
+from ..store import disk
 from ..store.schema import AXES, texts
 from .scene import moving_scene
 
@@ -222,7 +223,7 @@ def _write_tiff(
         "unit": "nm",
         "finterval": frame_time_s,
     }
-    aside = path.with_name(f".{path.name}.partial")
+    aside = disk.aside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         tifffile.imwrite(

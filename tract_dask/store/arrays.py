@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -54,7 +53,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(pixels))
     checksum = crc32c(pixels, crc32c(head.getbuffer())).to_bytes(CHECKSUM_BYTES, "little")
-    aside = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.partial")
+    aside = disk.new_place(path.parent)
     with disk_errors(path):
         try:
             with aside.open("wb") as file:

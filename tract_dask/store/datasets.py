@@ -81,7 +81,7 @@ def _opening(path: Path) -> Iterator[None]:
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     """Write a small Dataset as a Zarr store, whole or not at all."""
-    aside = path.with_name(f".{path.name}.partial")
+    aside = disk.aside(path)
     with disk_errors(path):
         remove(aside)
         write_arrays(dataset, aside)

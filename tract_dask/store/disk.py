@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import uuid
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -81,6 +82,20 @@ def together() -> Iterator[Batch]:
     finally:
         _open.reset(token)
         batch.discard()
+
+
+PARTIAL = ".partial"
+"""How the names of files and stores end that are being written."""
+
+
+def aside(path: Path, mark: object = "", suffix: str = "") -> Path:
+    """Return the hidden place beside ``path`` to write it at first; ``mark`` tells it from those of other writers."""
+    return path.with_name(f".{path.name}{f'.{mark}' if mark else ''}{PARTIAL}{suffix}")
+
+
+def new_place(folder: Path) -> Path:
+    """Return a place in ``folder`` to write a file at first, which nobody else has."""
+    return folder / f"{uuid.uuid4().hex}{PARTIAL}"
 
 
 def place(aside: Path, path: Path) -> None:

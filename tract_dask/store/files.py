@@ -16,7 +16,7 @@ from . import disk
 
 def write_aside(path: Path, data: bytes) -> None:
     """Write a small file so that it is either whole or not there: beside its place first, synced, then renamed."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    aside = disk.aside(path, os.getpid())
     with disk_errors(path):
         aside.write_bytes(data)
         disk.place_now(aside, path)

@@ -17,7 +17,7 @@ CHANGING = "changing"
 """Attribute that a movie has while its coordinates and its calibration are changed, and where that was cut off."""
 
 
-def describe(path: Path, ours: dict[str, Any]) -> None:
+def write_metadata(path: Path, ours: dict[str, Any]) -> None:
     """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own.
 
     Raises

@@ -25,7 +25,7 @@ from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
 from .schema import REJECTED, Status
 from .shard_files import CHUNK_KEYS, chunk_path, codecs
 
-CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose")
+_SCALES = schema.CALIBRATION[:-1]
 """What pixels and frames mean: attributes of the store, which any reader finds there."""
 
 FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
@@ -86,9 +86,9 @@ def create(
     static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
     for name in (*known, *schema.COLUMNS):
         static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
-    static.attrs = {name: about.get(name) for name in CALIBRATION}
+    static.attrs = {name: about.get(name) for name in _SCALES}
     static.attrs[metadata.ATTRIBUTE] = metadata.json_ready({**about, "complete": False})
-    aside = path.with_name(f".{path.name}.partial")
+    aside = disk.aside(path)
     step = min(frames_per_shard, len(time))
     per_file = _per_file(-(-len(time) // step), 8 * step * sizes["column_id"] * sizes["parameter"])
     with files.disk_errors(path):
@@ -249,7 +249,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
     if not about.get("complete"):
         dataset = _grown(dataset, path)
-    dataset.attrs |= {name: about.get(name) for name in CALIBRATION}
+    dataset.attrs |= {name: about.get(name) for name in _SCALES}
     settings = from_toml(FitSettings, about["settings"], str(path))
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
     return dataset

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import product
@@ -164,7 +163,7 @@ class ShardWriter:
     """
 
     def __init__(self, path: Path, aside: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> None:
-        self._path, self._aside, self._codec = path, aside / f"{uuid.uuid4().hex}.partial", codec
+        self._path, self._aside, self._codec = path, disk.new_place(aside), codec
         layers, rows, columns = grid.tiles
         depth, height, width = grid.chunk
         self._index = np.full((layers, rows, columns, 2), ABSENT, "<u8")

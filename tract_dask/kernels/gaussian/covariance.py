@@ -19,8 +19,8 @@ import numpy as np
 
 from ..vectors.tracing import Index, Mask, Rows, Vector, absolute, exp, fewer, larger, loop, select, spread, sqrt
 from .moments import (
-    AMPLITUDE,
-    BACKGROUND,
+    AMPLITUDE_ROW,
+    BACKGROUND_ROW,
     COS,
     CURVATURE_U,
     CURVATURE_V,
@@ -65,8 +65,8 @@ def _variance(point: Rows, offset: Vector, counting: Index) -> tuple[Vector, Vec
 
     ``offset`` is what was subtracted from the pixels.
     """
-    amplitude = point[AMPLITUDE]
-    floor = larger(point[BACKGROUND] + offset, 0)
+    amplitude = point[AMPLITUDE_ROW]
+    floor = larger(point[BACKGROUND_ROW] + offset, 0)
     total = absolute(amplitude) + floor
     usable = (floor + amplitude >= 0) & (total > 0) & (spread(counting) > 0)
     return select(usable, floor / total, 1), select(usable, amplitude / total, 0)
@@ -119,7 +119,7 @@ def _meat(point: Rows, narrow: Any, own: list[Vector]) -> list[Vector]:
     and v.
     """
     u, v = narrow
-    amplitude = point[AMPLITUDE] * u * v
+    amplitude = point[AMPLITUDE_ROW] * u * v
     uu, vv, half = u * u, v * v, -0.5 * amplitude
     main = [u * v, amplitude * uu, amplitude * vv, half * uu * uu, -amplitude * uu * vv, half * vv * vv, u.of(1)]
     extra = {3: half * (1 - uu), 5: half * (1 - vv)}
@@ -201,6 +201,6 @@ def standard_errors(
     size = select(known & (freedom > 0), larger(sums[MERIT], 0) / freedom, np.nan)
     for i in range(7):
         errors[i] = select(free[i] > 0, sqrt(_quadratic(meat, inverse[i]) * size), np.nan)
-    amplitude = point[AMPLITUDE]
+    amplitude = point[AMPLITUDE_ROW]
     volume = [inverse[0][j] / amplitude - 0.5 * (inverse[3][j] + inverse[5][j]) for j in range(7)]
     errors[7] = sqrt(_quadratic(meat, volume) * size)

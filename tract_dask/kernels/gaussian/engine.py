@@ -38,8 +38,8 @@ from .iteration import (
     run,
 )
 from .moments import (
-    AMPLITUDE,
-    BACKGROUND,
+    AMPLITUDE_ROW,
+    BACKGROUND_ROW,
     COS,
     CURVATURE_U,
     CURVATURE_V,
@@ -141,7 +141,7 @@ def _grid(frame: Frame, sums: Any) -> Grid:
     return Grid(height, width, height // 2, width // 2, n_pixels, half, places[0], places[1], places[2])
 
 
-_LINEAR = ((0, AMPLITUDE, 0), (1, X, 1), (2, Y, 2), (6, BACKGROUND, 4))
+_LINEAR = ((0, AMPLITUDE_ROW, 0), (1, X, 1), (2, Y, 2), (6, BACKGROUND_ROW, 4))
 """Where amplitude, x, y and background are among the parameters, in a point, and among the bounds."""
 
 
@@ -159,7 +159,7 @@ def _sigma_bounds(problem: Problem, lower: Array, upper: Array) -> Any:
 def _to_likelihood(row: Array) -> None:
     """Let a fit go on, with nothing subtracted from the pixels."""
     level = row[OFFSET] * row[FACTOR]
-    row[POINT + BACKGROUND] += level
+    row[POINT + BACKGROUND_ROW] += level
     row[BOUNDS + LOWER + 4] += level
     row[BOUNDS + UPPER + 4] += level
     for i in range(N_PARAMETERS):

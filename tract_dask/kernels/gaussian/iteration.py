@@ -33,8 +33,8 @@ from ..vectors.tracing import (
     traced,
 )
 from .moments import (
-    AMPLITUDE,
-    BACKGROUND,
+    AMPLITUDE_ROW,
+    BACKGROUND_ROW,
     CURVATURE_U,
     CURVATURE_V,
     DATA,
@@ -133,10 +133,10 @@ def _normalise(block: Rows, grid: Grid, state: Rows) -> None:
     offset = state[OFFSET] = select(fresh, select(finite, mean, 0), state[OFFSET])
     factor = state[FACTOR] = select(fresh, 1 / select(usable, span, 1), state[FACTOR])
     for place, origin in (
-        (TRIAL + AMPLITUDE, none),
+        (TRIAL + AMPLITUDE_ROW, none),
         (BOUNDS + LOWER, none),
         (BOUNDS + UPPER, none),
-        (TRIAL + BACKGROUND, offset),
+        (TRIAL + BACKGROUND_ROW, offset),
         (BOUNDS + LOWER + 4, offset),
         (BOUNDS + UPPER + 4, offset),
     ):
@@ -186,7 +186,7 @@ def _project(state: Rows, sums: list[Vector], n_pixels: Vector) -> None:
     """Set the trial's amplitude and background to the best ones for its shape; turn the sums into the residual's."""
     first, second = state[PIXELS], state[PIXELS + 1]
     trial, bounds = state + TRIAL, state + BOUNDS
-    before, base = trial[AMPLITUDE], trial[BACKGROUND]
+    before, base = trial[AMPLITUDE_ROW], trial[BACKGROUND_ROW]
 
     def bounded(best: Vector) -> Vector:
         """Return the amplitude within its bounds, but not less than half of what it was: it must not vanish."""
@@ -203,7 +203,7 @@ def _project(state: Rows, sums: list[Vector], n_pixels: Vector) -> None:
     background = _within(free, bounds[LOWER + 4], bounds[UPPER + 4])
     on_bound = usable & ((background > free) | (background < free))
     amplitude = select(on_bound, bounded((ed - background * e) / ee), amplitude)
-    trial[AMPLITUDE], trial[BACKGROUND] = amplitude, background
+    trial[AMPLITUDE_ROW], trial[BACKGROUND_ROW] = amplitude, background
     merit = second + amplitude * (amplitude * ee - 2 * ed + 2 * background * e)
     merit = merit + background * (background * n_pixels - 2 * first)
     sums[MERIT:] = [merit, merit]
@@ -227,8 +227,8 @@ def _gain(state: Rows, sums: list[Vector]) -> Vector:
     """
     point, trial = state + POINT, state + TRIAL
     bends = [new - old for new, old in zip(_exponent(trial), _exponent(point), strict=True)]
-    by_amplitude = trial[AMPLITUDE] - point[AMPLITUDE]
-    by_background = trial[BACKGROUND] - point[BACKGROUND]
+    by_amplitude = trial[AMPLITUDE_ROW] - point[AMPLITUDE_ROW]
+    by_background = trial[BACKGROUND_ROW] - point[BACKGROUND_ROW]
 
     def slope(amplitude: Vector, own: list[Vector]) -> Vector:
         bend = bends[0] * own[DATA]
@@ -236,7 +236,7 @@ def _gain(state: Rows, sums: list[Vector]) -> Vector:
             bend = bend + bends[k] * own[DATA + k]
         return by_amplitude * own[DATA] + by_background * own[TOTAL] - 0.5 * amplitude * bend
 
-    return 0.5 * (slope(point[AMPLITUDE], read(state, SUMS, N_SUMS)) + slope(trial[AMPLITUDE], sums))
+    return 0.5 * (slope(point[AMPLITUDE_ROW], read(state, SUMS, N_SUMS)) + slope(trial[AMPLITUDE_ROW], sums))
 
 
 @traced()

@@ -83,7 +83,7 @@ class Shape(NamedTuple):
     c: Any
 
 
-AMPLITUDE, X, Y, CURVATURE_U, CURVATURE_V, COS, SIN, BACKGROUND, N_PARAMETERS = 0, 1, 2, 3, 4, 5, 6, 7, 8
+AMPLITUDE_ROW, X, Y, CURVATURE_U, CURVATURE_V, COS, SIN, BACKGROUND_ROW, N_PARAMETERS = 0, 1, 2, 3, 4, 5, 6, 7, 8
 """Rows of a point: the curvatures 1 / sigma^2 along the axes u = (cos, sin) and v = (-sin, cos), with |sin| <= cos."""
 
 
@@ -218,7 +218,7 @@ def _sum_segment(block: Rows, grid: Grid, segment: Any, point: Rows, likelihood:
     """Write the moments of a window's columns from ``begin`` to before ``end`` about their anchor."""
     begin, end, anchor = segment
     middle, shape = grid.half_width, shape_of(point)
-    model = point[AMPLITUDE], point[BACKGROUND]
+    model = point[AMPLITUDE_ROW], point[BACKGROUND_ROW]
     dx = spread(anchor - middle) - shape.x
 
     def row(y: Index, _: list[Vector]) -> list[Vector]:

@@ -19,8 +19,8 @@ import numpy as np
 
 from ..vectors.tracing import Mask, Rows, Vector, absolute, larger, select, smaller, sqrt
 from .moments import (
-    AMPLITUDE,
-    BACKGROUND,
+    AMPLITUDE_ROW,
+    BACKGROUND_ROW,
     COS,
     CURVATURE_U,
     CURVATURE_V,
@@ -42,7 +42,7 @@ LOWER, UPPER, N_BOUNDS = 0, 5, 10
 """Rows of the bounds: amplitude, x, y, curvature, background."""
 
 BOUND_OF = (0, 1, 2, 3, 3, 3, 4)
-ROW_OF = (AMPLITUDE, X, Y, CURVATURE_U, -1, CURVATURE_V, BACKGROUND)
+ROW_OF = (AMPLITUDE_ROW, X, Y, CURVATURE_U, -1, CURVATURE_V, BACKGROUND_ROW)
 _SINGULAR = np.float32(1e-6)
 _FREE_OF = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of u and v in the derivatives by amplitude, centre, P, S and Q, beside E."""
@@ -92,7 +92,7 @@ def write(rows: Rows, first: int, values: list[Vector]) -> None:
 def assemble(point: Rows, sums: Rows) -> tuple[list[Vector], list[Vector], list[Vector]]:
     """Return J^T J, the same with second derivatives, and the gradient at a point (8,), given its sums."""
     own = read(sums, 0, WEIGHT + 1)
-    amplitude, cos, sin = point[AMPLITUDE], point[COS], point[SIN]
+    amplitude, cos, sin = point[AMPLITUDE_ROW], point[COS], point[SIN]
     scale_u, scale_v = sqrt(point[CURVATURE_U]), sqrt(point[CURVATURE_V])
     to_axes(own, KINDS, (point[X], point[Y]), (cos, sin, scale_u, scale_v))
     by_shape = -0.5 * amplitude

@@ -19,6 +19,7 @@ from ...errors import MissingStoreError
 from ...settings.run import RunSettings
 from ...settings.toml import from_dict
 from ...stages.columns.sites import MOST_SITES
+from ...store.run_folder import COLUMNS, SUM, TABLE
 from ..auth.tokens import Identity, Role
 from ..checks import inside
 from ..errors import invalid
@@ -339,7 +340,7 @@ def scene_of_job(job_id: JobId, request: Request) -> Scene:
     """Return the image on which the columns of a job are edited."""
     job: Job = request.app.state.store.job(job_id)
     settings = inside(request.app.state.root, from_dict(RunSettings, job.settings))
-    folder = folder_of(request, job_id, "sum.zarr", "columns.zarr", "columns.csv")
+    folder = folder_of(request, job_id, SUM, COLUMNS, TABLE)
     return column_editing.scene_of(folder, settings)
 
 

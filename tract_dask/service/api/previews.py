@@ -13,7 +13,9 @@ from ...errors import MissingStoreError
 from ...readers.listing import FileList
 from ...settings.run import MetadataSettings, SourceSettings
 from ...settings.toml import from_dict
+from ...store.damage import METADATA
 from ...store.metadata import attributes
+from ...store.run_folder import MOVIE, SUM
 from ..views import pictures
 from ..views.pictures import MAX_SIDE_PX, View
 from .answers import NOT_MODIFIED, Version, kept_answer, stamp
@@ -214,13 +216,13 @@ def _version(place: str | FileList) -> str:
     if isinstance(place, FileList):
         return stamp(*sorted(place.files))
     outer = Path(place.partition("::")[0])
-    return stamp(outer / "zarr.json" if outer.suffix == ".zarr" else outer)
+    return stamp(outer / METADATA if outer.suffix == ".zarr" else outer)
 
 
 def _job_movie(request: Request, job_id: str) -> tuple[tuple[str | FileList, SourceSettings, MetadataSettings], str]:
     """Return where the movie of a job is, converted if it is already, and its version."""
     state = request.app.state
-    job, converted = state.store.job(job_id), folder_of(request, job_id, "movie.zarr") / "movie.zarr"
+    job, converted = state.store.job(job_id), folder_of(request, job_id, MOVIE) / MOVIE
     place = str(converted) if attributes(converted).get("complete") else state.root.source(job.source)
     source = from_dict(SourceSettings, job.settings.get("source", {}))
     metadata = from_dict(MetadataSettings, job.settings.get("metadata", {}))
@@ -235,8 +237,8 @@ def _sum(request: Request, job_id: str) -> tuple[Path, str]:
     MissingStoreError
         Where there is none yet.
     """
-    folder = folder_of(request, job_id, "sum.zarr")
-    about = folder / "sum.zarr" / "zarr.json"
+    folder = folder_of(request, job_id, SUM)
+    about = folder / SUM / METADATA
     if not about.is_file():
         raise MissingStoreError(
             "there is no summed image yet", job_id, "a job whose stage sum is done", remedy="Wait for it"

@@ -13,6 +13,7 @@ from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
 from ...store.journal import journal_beside
+from ...store.run_folder import REPORT, RESULTS, SETTINGS
 from ..views import exports, tracks
 from .answers import NOT_MODIFIED, kept_answer, stamp
 from .models import JobId, errors
@@ -45,7 +46,7 @@ _DOWNLOAD: dict[int | str, dict[str, Any]] = errors(400, 404, 503) | {
     }
 }
 _PREPARE_S = 1.0
-_READ = ("results.zarr", "results.zarr.journal", "run.toml")
+_READ = (RESULTS, f"{RESULTS}.journal", SETTINGS)
 """What the answers are made from."""
 
 Points = Annotated[int, Query(ge=2, le=20_000, description="Most points; longer series are averaged over frames.")]
@@ -124,7 +125,7 @@ async def download_results(
 )
 def read_report(job_id: JobId, request: Request) -> Response:
     """Show the report of a job that is done."""
-    place = folder_of(request, job_id, "report.html") / "report.html"
+    place = folder_of(request, job_id, REPORT) / REPORT
     if not place.is_file():
         raise MissingStoreError(
             "there is no report", place.parent.name, "the job to be done", remedy="Wait until the job is done"
@@ -149,7 +150,7 @@ def _results(request: Request, job_id: str) -> tuple[Path, str]:
     MissingStoreError
         Where there are none yet.
     """
-    path = folder_of(request, job_id, *_READ) / "results.zarr"
+    path = folder_of(request, job_id, *_READ) / RESULTS
     if not (path / "zarr.json").is_file():
         raise MissingStoreError(
             "there are no results yet", job_id, "a job whose fits have begun", remedy="Wait for the stage fit"

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from ...errors import StoreError
+from ...store import disk
 
 _FIRST = """
 CREATE TABLE jobs (
@@ -195,7 +196,7 @@ def _back_up(db: sqlite3.Connection, path: Path, version: int) -> None:
     copy = path.with_name(f"{path.name}.version-{version}")
     if copy.exists():
         return
-    aside = path.with_name(f".{copy.name}.{os.getpid()}.partial")
+    aside = disk.aside(copy, os.getpid())
     aside.unlink(missing_ok=True)
     try:
         with closing(sqlite3.connect(aside)) as target:

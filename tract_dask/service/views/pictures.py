@@ -30,6 +30,7 @@ from ...readers.source import Permit, SourceMetadata
 from ...settings.run import MetadataSettings, SourceSettings
 from ...store import datasets
 from ...store.movie import Movie, open_movie
+from ...store.run_folder import RunFolder
 
 Pixels = NDArray[Any]
 Floats = NDArray[np.float32]
@@ -150,12 +151,12 @@ def source_levels(frame: MovieFrame, view: View) -> bytes:
 
 def sum_png(folder: Path, view: View, stamp: str) -> bytes:
     """Return the summed image of a run as PNG."""
-    return _png(sum_plane(folder / "sum.zarr", stamp), view)
+    return _png(sum_plane(RunFolder(folder).sum, stamp), view)
 
 
 def sum_levels(folder: Path, view: View, stamp: str) -> bytes:
     """Return what values the summed image of a run has, and the size of its pixels."""
-    path = folder / "sum.zarr"
+    path = RunFolder(folder).sum
     found = levels(sum_plane(path, stamp), view)
     pixel_size = zarr.open_group(path, mode="r").attrs.get("pixel_size_pm")
     return as_json(found | {"pixel_size_pm": pixel_size, "version": stamp})

@@ -21,6 +21,7 @@ from ...kernels.gaussian import parameters
 from ...settings.run import FitSettings
 from ...settings.toml import from_toml, load, to_dict
 from ...store import datasets, metadata, results, schema
+from ...store.run_folder import RunFolder
 from .pictures import as_json
 from .track_cache import QUANTITIES, open_tracks
 
@@ -59,7 +60,7 @@ class Calibration:
 
 def summary(folder: Path, cache: Path, version: str) -> bytes:
     """Return how much is done, what was measured, and how."""
-    path = folder / "results.zarr"
+    path = RunFolder(folder).results
     tracks, known, about = open_tracks(path, cache), _calibration(path), metadata.attributes(path)
     sizes = len(tracks.done), len(tracks.columns["fits"])
     return as_json(
@@ -90,7 +91,7 @@ def summary(folder: Path, cache: Path, version: str) -> bytes:
 
 def columns(folder: Path, cache: Path, version: str) -> bytes:
     """Return the numbers of every column."""
-    path = folder / "results.zarr"
+    path = RunFolder(folder).results
     tracks, known, static = open_tracks(path, cache), _calibration(path), _static(path)
     of = tracks.columns
     count = of["accepted"]
@@ -136,7 +137,7 @@ def series(
     InputError
         Where there is no such column or frame.
     """
-    path = folder / "results.zarr"
+    path = RunFolder(folder).results
     tracks, known, static = open_tracks(path, cache), _calibration(path), _static(path)
     ids = static["column_id"].to_numpy().tolist()
     if column_id not in ids:
@@ -170,7 +171,7 @@ def series(
 
 def frames(folder: Path, cache: Path, points: int, version: str) -> bytes:
     """Return drift, share of accepted fits and mean amplitude over the frames, averaged where they are many."""
-    path = folder / "results.zarr"
+    path = RunFolder(folder).results
     tracks, known = open_tracks(path, cache), _calibration(path)
     n_frames, of = len(tracks.done), tracks.frames
     step = -(-n_frames // points)
@@ -198,7 +199,7 @@ def displacement(folder: Path, first: int, second: int, version: str) -> bytes:
     InputError
         Where there is no such frame.
     """
-    path = folder / "results.zarr"
+    path = RunFolder(folder).results
     tracks, known = _only(path, (first, second)), _calibration(path)
     moved = motion.displacement(tracks, first, second)
     values = {
@@ -332,7 +333,7 @@ def _binned(name: str, values: Floats, error: Floats, step: int) -> dict[str, An
 def _settings(folder: Path, about: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of the run by group; those of the fit alone where the run's cannot be read."""
     try:
-        return to_dict(load(folder / "run.toml"))
+        return to_dict(load(RunFolder(folder).settings))
     except SettingsError:
         return {"fit": to_dict(from_toml(FitSettings, about["settings"]))}
 

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from ...errors import InputError, SettingsError
 from ...kernels.blur import cut_windows
-from ...kernels.gaussian import parameters
 from ...kernels.gaussian.fit import GaussianFits, fit_gaussians
+from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.magnitude import unit_of
 from ...kernels.peaks import centroids, climb
 from ...settings.run import ColumnSettings
@@ -28,7 +28,6 @@ from .window_size import check_window, default_window, neighbour_distance
 __all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
 
 Places = NDArray[np.float64]
-AMPLITUDE, X, Y, SIGMA_A, SIGMA_B, THETA, BACKGROUND = range(len(parameters.PARAMETERS))
 
 _SAME = 1 / 3
 """Seeds nearer than this share of the spacing, after refinement, are one column."""

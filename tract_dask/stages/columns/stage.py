@@ -18,7 +18,7 @@ import xarray as xr
 from ...errors import DestinationError
 from ...progress import Sink, StageDone, StageStarted, Warned, silent
 from ...settings.run import ColumnSettings, FitSettings
-from ...store import datasets, files, metadata
+from ...store import datasets, disk, files, metadata
 from ...store.columns import check_inside, read_columns_csv, write_columns_csv
 from ...store.keys import counted
 from ...store.provenance import stage_key
@@ -212,7 +212,7 @@ def reopened(store: Path) -> xr.Dataset:
 
 def _render(columns: xr.Dataset, csv: Path) -> bytes:
     """Return the table of ``columns`` as it will stand in ``csv``."""
-    aside = csv.with_name(f".{csv.name}.partial")
+    aside = disk.aside(csv)
     write_columns_csv(columns, aside)
     table = aside.read_bytes()
     aside.unlink()

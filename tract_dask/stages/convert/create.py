@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ...readers.source import SourceMetadata
 from ...settings.run import MetadataSettings
 from ...store import datasets, disk, files, schema
-from ...store import metadata as store_metadata
 from ...store.layout import LEVEL_DTYPE, Layout
-from ...store.ome import AXES, CHANGING, describe
+from ...store.metadata import attributes, update_attributes
+from ...store.ome import AXES, CHANGING, write_metadata
 from ...store.shard_files import CHUNK_KEYS, Grid, codecs
 
 
@@ -28,18 +28,18 @@ def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
     StoreError
         Where it cannot be written.
     """
-    present, now = store_metadata.attributes(path), quantities(metadata) | more
+    present, now = attributes(path), quantities(metadata) | more
     cut_off = present.pop(CHANGING, False)
     if cut_off or any(present.get(name) != value for name, value in now.items()):
         mark: dict[str, Any] = {CHANGING: True}
         with files.disk_errors(path):
-            store_metadata.update_attributes(path, **mark)  # coordinates and root change one after the other
-            describe(path, present | now)
+            update_attributes(path, **mark)  # coordinates and root change one after the other
+            write_metadata(path, present | now)
 
 
 def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known: SourceMetadata) -> None:
     """Make the store with all its arrays, still empty: whole or not at all."""
-    aside = path.with_name(f".{path.name}.partial")
+    aside = disk.aside(path)
     files.remove(aside)
     zarr.create_group(aside, zarr_format=3)
     zarr.create_group(aside / "binned", zarr_format=3)
@@ -59,7 +59,7 @@ def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known:
         "chunk": layout.chunk,
         "bins": layout.bins,
     }
-    describe(aside, about | plan | quantities(known))
+    write_metadata(aside, about | plan | quantities(known))
     disk.place_folder(aside, path)
 
 
@@ -99,7 +99,7 @@ def finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: Sour
         for name, values in statistics.items():
             datasets.overwrite_array(path / name, values)
         disk.sync_folders(path, tuple(statistics))
-        describe(path, store_metadata.attributes(path) | quantities(known) | {"complete": True})
+        write_metadata(path, attributes(path) | quantities(known) | {"complete": True})
 
 
 def quantities(metadata: SourceMetadata | MetadataSettings) -> dict[str, Any]:

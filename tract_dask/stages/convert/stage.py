@@ -24,7 +24,7 @@ from ...readers import files_named_now, open_source
 from ...readers.source import FrameSource, SourceMetadata, check_permitted
 from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, SourceSettings
 from ...settings.toml import from_toml, to_toml
-from ...store import schema
+from ...store import disk, schema
 from ...store.files import check_free_space, disk_errors, remove
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.layout import Layout, disk_bytes, plan_layout
@@ -199,7 +199,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     on_event(StageStarted(STAGE, sum(shard.frames for shard in chosen), frame_bytes=frame_bytes))
     started = time.perf_counter()
     statistics = {name: np.empty(layout.shape[0]) for name in schema.STATISTICS}
-    aside = path.with_name(f".{path.name}.repair.partial")
+    aside = disk.aside(path, "repair")
     remove(aside)
     with disk_errors(path), ExitStack() as stack:
         stack.callback(remove, aside)

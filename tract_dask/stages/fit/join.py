@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -85,7 +84,7 @@ def _join_task(job: _Joining, file: Shard) -> Payload:
         raise DamagedPartError("the fits of some shards are no longer on disk", str(parts.run), remedy=AGAIN)
     with disk_errors(job.path), ExitStack() as stack:
         for name in SHARDED:
-            place = job.aside / f"{uuid.uuid4().hex}.partial"
+            place = disk.new_place(job.aside)
             stack.callback(place.unlink, missing_ok=True)
             with place.open("wb") as target:
                 target.writelines(joined(parts, name, shards, job.per_file))
