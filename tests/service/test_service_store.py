@@ -21,7 +21,7 @@ from tract_dask.service.jobs import store, tables
 from tract_dask.service.jobs.records import ConflictError, Job, UnknownJobError
 from tract_dask.service.jobs.states import CURATABLE, ENDED, RETRYABLE, TRANSITIONS, State
 from tract_dask.service.jobs.store import JobStore
-from tract_dask.service.runner.fair_queue import next_job
+from tract_dask.service.runner.runner import next_job
 
 TABLES = ("jobs", "transitions", "events", "columns")
 

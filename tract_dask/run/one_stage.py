@@ -25,19 +25,10 @@ from ..store import datasets, files, metadata
 from ..store.movie import Movie, open_movie
 from ..store.run_folder import sum_beside
 from ..store.schema import drift_of
-from .checks import (
-    check_columns,
-    check_drift,
-    check_fit,
-    check_pixels_of,
-    check_suffix,
-    open_input,
-    with_whole_paths,
-)
-from .columns_picture import draw_columns
+from .checks import check_columns, check_drift, check_fit, check_pixels_of, check_suffix, open_input, with_whole_paths
 from .pipeline import refine_columns_of
 from .plan import plan_run
-from .session import Session
+from .session import Session, draw_columns
 
 
 def run_convert(

@@ -39,18 +39,9 @@ from ..store import files, metadata
 from ..store.journal import journal_beside, remove_journal
 from ..store.movie import Movie
 from ..store.run_folder import RunFolder, sole_run
-from .checks import (
-    check_fit,
-    check_inputs,
-    check_output,
-    check_pixels_of,
-    check_stage,
-    open_input,
-    with_whole_paths,
-)
-from .columns_picture import draw_columns
+from .checks import check_fit, check_inputs, check_output, check_pixels_of, check_stage, open_input, with_whole_paths
 from .plan import Plan, expected_limit, plan_run
-from .session import Record, Session
+from .session import Record, Session, draw_columns
 
 
 @dataclass(frozen=True)

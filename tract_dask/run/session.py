@@ -1,4 +1,4 @@
-"""What surrounds a run: client, events, and work in the background."""
+"""What surrounds a run: client, events, and work in the background, such as the picture of the columns."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from time import perf_counter
 from types import TracebackType
 
+import xarray as xr
 from distributed import Client
 
 from ..cluster.connect import LazyClient, memory_budget
@@ -27,6 +28,7 @@ from ..progress import (
     Warned,
 )
 from ..settings.cluster import ClusterSettings
+from ..store import disk
 from .plan import Plan
 
 
@@ -131,3 +133,12 @@ def _get_ready() -> None:
     from ..plots.columns import plot_columns  # noqa: F401
 
     load_kernels()
+
+
+def draw_columns(summed: xr.Dataset, columns: xr.Dataset, figure: Path) -> None:
+    """Draw the columns beside the place of their figure, then put them there, so that a figure is always whole."""
+    from ..plots.columns import plot_columns  # matplotlib takes its time, and not every run draws
+
+    partial_figure = disk.aside(figure, suffix=figure.suffix)
+    plot_columns(summed, columns, partial_figure)
+    partial_figure.replace(figure)
