@@ -79,27 +79,7 @@ def mixture(intensity: xr.DataArray, max_components: int = 12, *, criterion: str
     >>> groups.location.values.round(1).tolist()
     [1.0, 2.0, 3.0]
     """
-    if criterion not in ("icl", "bic"):
-        raise SettingsError("the criterion cannot be used", "mixture", "icl or bic", repr(criterion))
-    if intensity.dims != ("column_id",):
-        raise SettingsError(
-            "there is not one intensity for each column",
-            "mixture: intensity",
-            "dimensions ('column_id',)",
-            str(intensity.dims),
-            "Take the mean over the frames, or a frame",
-        )
-    values = intensity.to_numpy().astype(np.float64)
-    known = np.isfinite(values)
-    most = min(max_components, int(known.sum()) // 3)
-    if most < 2 or not np.ptp(values[known]) > 0:
-        raise SettingsError(
-            "there are too few columns to sort",
-            "mixture: intensity",
-            "six different intensities or more, and two components",
-            f"{known.sum()} intensities, {max_components} components",
-            "Use a look-up table instead",
-        )
+    values, known, most = _checked(intensity, criterion, max_components)
     fits = [_best(values[known], n) for n in range(1, most + 1)]
     bic = np.array([-2 * fit.log_likelihood + 2 * n * np.log(known.sum()) for n, fit in enumerate(fits, start=1)])
     shares = [_membership(values[known], fit)[0] for fit in fits]
@@ -134,6 +114,32 @@ def mixture(intensity: xr.DataArray, max_components: int = 12, *, criterion: str
         },
         coordinates | {name: array for name, array in intensity.coords.items() if name == "column_id"},
     )
+
+
+def _checked(intensity: xr.DataArray, criterion: str, max_components: int) -> tuple[Floats, NDArray[np.bool_], int]:
+    """Return the intensities, which of them are known, and the most components that they allow."""
+    if criterion not in ("icl", "bic"):
+        raise SettingsError("the criterion cannot be used", "mixture", "icl or bic", repr(criterion))
+    if intensity.dims != ("column_id",):
+        raise SettingsError(
+            "there is not one intensity for each column",
+            "mixture: intensity",
+            "dimensions ('column_id',)",
+            str(intensity.dims),
+            "Take the mean over the frames, or a frame",
+        )
+    values = intensity.to_numpy().astype(np.float64)
+    known = np.isfinite(values)
+    most = min(max_components, int(known.sum()) // 3)
+    if most < 2 or not np.ptp(values[known]) > 0:
+        raise SettingsError(
+            "there are too few columns to sort",
+            "mixture: intensity",
+            "six different intensities or more, and two components",
+            f"{known.sum()} intensities, {max_components} components",
+            "Use a look-up table instead",
+        )
+    return values, known, most
 
 
 def _best(values: Floats, n: int) -> _Fit:

@@ -117,15 +117,7 @@ def count_atoms(
     if frames == "each":
         inputs = (intensity, xr.where(weak, expected, sigma), limit, weak, xr.ones_like(intensity))
     else:
-        seen = intensity.notnull()
-        n = seen.sum("frame")
-        never = (n == 0) & weak.any("frame")
-        mean_sigma = xr.DataArray(
-            np.exp(xr.DataArray(np.log(sigma)).mean("frame"))
-        )  # of free shapes a few errors are huge
-        mean_expected = expected.mean(set(expected.dims) - {"column_id"})
-        limits = limit.where(seen | never).mean("frame")
-        inputs = (intensity.mean("frame"), mean_sigma.where(n > 0, mean_expected), limits, never, n)
+        inputs = _means(intensity, sigma, expected, limit, weak)
     probability = xr.apply_ufunc(
         probabilities,
         *inputs,
@@ -137,6 +129,19 @@ def count_atoms(
         dask_gufunc_kwargs={"output_sizes": {"n_atoms": len(levels.numbers)}},
     ).assign_coords(n_atoms=levels.numbers)
     return _summary(probability, levels)
+
+
+def _means(
+    intensity: xr.DataArray, sigma: xr.DataArray, expected: xr.DataArray, limit: xr.DataArray, weak: xr.DataArray
+) -> tuple[xr.DataArray, ...]:
+    """Return what :func:`probabilities` takes for the means over the frames in which the columns were accepted."""
+    seen = intensity.notnull()
+    n = seen.sum("frame")
+    never = (n == 0) & weak.any("frame")
+    mean_sigma = xr.DataArray(np.exp(xr.DataArray(np.log(sigma)).mean("frame")))  # of free shapes a few errors are huge
+    mean_expected = expected.mean(set(expected.dims) - {"column_id"})
+    limits = limit.where(seen | never).mean("frame")
+    return intensity.mean("frame"), mean_sigma.where(n > 0, mean_expected), limits, never, n
 
 
 def dose_to_be_sure(

@@ -91,26 +91,18 @@ def ceria_surface(height_pm: float, width_pm: float, margin_pm: float) -> Surfac
         ("O", x + ROW_SHIFT_PM, y - ROW_SPACING_PM / 4, _oxygen_atoms(atoms, right, above)),
         ("O", x - ROW_SHIFT_PM, y + ROW_SPACING_PM / 4, _oxygen_atoms(atoms, left, below)),
     ]
-    kept = [
-        (
-            there := (n > 0)
-            & (px > -margin_pm)
-            & (px < width_pm + margin_pm)
-            & (py > -margin_pm)
-            & (py < height_pm + margin_pm),
-            px[there],
-            py[there],
-            n[there],
-            np.full(int(there.sum()), kind),
-        )
-        for kind, px, py, n in parts
-    ]
+
+    def inside(px: FloatArray, py: FloatArray) -> Any:
+        along = (px > -margin_pm) & (px < width_pm + margin_pm)
+        return along & (py > -margin_pm) & (py < height_pm + margin_pm)
+
+    kept = [(kind, px, py, n, (n > 0) & inside(px, py)) for kind, px, py, n in parts]
     return Surface(
-        x=np.concatenate([part[1] for part in kept]),
-        y=np.concatenate([part[2] for part in kept]),
-        atoms=np.concatenate([part[3] for part in kept]).astype(np.int8),
-        kind=np.concatenate([part[4] for part in kept]),
-        row=np.concatenate([row[part[0]] for part in kept]),
+        x=np.concatenate([px[there] for _, px, _, _, there in kept]),
+        y=np.concatenate([py[there] for _, _, py, _, there in kept]),
+        atoms=np.concatenate([n[there] for _, _, _, n, there in kept]).astype(np.int8),
+        kind=np.concatenate([np.full(int(there.sum()), kind) for kind, _, _, _, there in kept]),
+        row=np.concatenate([row[there] for _, _, _, _, there in kept]),
         upper_y=lower_y - 1.5 * ROW_SPACING_PM,
         lower_y=lower_y - 0.5 * ROW_SPACING_PM,
         step_x=step_x,

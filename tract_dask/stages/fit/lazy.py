@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,8 @@ def fit_columns(
             [values[name].reshape(len(values["noise"]), -1) for name in names], axis=1, dtype=np.float64
         )
 
-    width = sum(int(np.prod([sizes[dim] for dim in schema.RESULTS[name].dims[1:]], dtype=int)) for name in names)
+    tails = {name: tuple(sizes[dim] for dim in schema.RESULTS[name].dims[1:]) for name in names}
+    width = sum(math.prod(tail) for tail in tails.values())
     packed = da.map_blocks(
         fit_packed,
         da.arange(len(chunk), chunks=1),
@@ -78,18 +80,20 @@ def fit_columns(
         dtype=np.float64,
         name=False,
     )
-    variables: dict[str, Any] = {}
-    offset = 0
-    for name in names:
-        variable = schema.RESULTS[name]
-        tail = tuple(sizes[dim] for dim in variable.dims[1:])
-        count = int(np.prod(tail, dtype=int))
-        block = packed[:, offset : offset + count].reshape((movie.n_frames, *tail))
-        variables[name] = (variable.dims, block.astype(variable.dtype), variable.attributes)
-        offset += count
-    dataset = columns.assign_coords(schema.coordinates(movie.n_frames)).assign(variables)
+    dataset = columns.assign_coords(schema.coordinates(movie.n_frames)).assign(_unpacked(packed, tails))
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", frame_times(movie), schema.RESULTS["time"].attributes)
     blur = columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px)
     dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window, blur)
     return dataset
+
+
+def _unpacked(packed: Any, tails: dict[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Return the variables that lie side by side in an array (frames, values), each of a shape ``tails`` a frame."""
+    variables, offset = {}, 0
+    for name, tail in tails.items():
+        variable, count = schema.RESULTS[name], math.prod(tail)
+        block = packed[:, offset : offset + count].reshape((len(packed), *tail))
+        variables[name] = (variable.dims, block.astype(variable.dtype), variable.attributes)
+        offset += count
+    return variables
