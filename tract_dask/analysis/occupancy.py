@@ -115,7 +115,13 @@ def count_atoms(
     limit = threshold * good["noise"] * reference["area"] / unit
     weak = ((good["status"] & np.uint8(Status.BELOW_NOISE)) != 0) & ((good["status"] & np.uint8(_UNKNOWN)) == 0)
     if frames == "each":
-        inputs = (intensity, xr.where(weak, expected, sigma), limit, weak, xr.ones_like(intensity))
+        inputs: tuple[xr.DataArray, ...] = (
+            intensity,
+            xr.where(weak, expected, sigma),
+            limit,
+            weak,
+            xr.ones_like(intensity),
+        )
     else:
         inputs = _means(intensity, sigma, expected, limit, weak)
     probability = xr.apply_ufunc(
