@@ -19,6 +19,7 @@ from tract_dask.simulate.movie import simulate_movie
 
 ROOT = Path(__file__).parents[1]
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 RUN_BY = "scripts/test"
 """The one command that is not run here, since it is what runs this."""
 
@@ -136,6 +137,22 @@ def test_examples_of_the_analysis(folder):
     for block in blocks("docs/analysis.md", "bash"):
         call("bash", "-euo", "pipefail", "-c", block, folder=folder)
     call(sys.executable, "-c", "\n".join(blocks("docs/analysis.md", "python")), folder=folder)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.name)
+def test_links_to_files_lead_somewhere(document):
+    links = re.findall(r"\]\(([^)\s:#]+)(?:#[^)]*)?\)", document.read_text(encoding="utf-8"))
+    assert [link for link in links if not (document.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("document", ["architecture.md", "kernels.md"])
+def test_what_a_page_names_with_its_file_is_defined_there(document):
+    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
+    found = re.findall(r"`(?:\w+\.)?(\w+)`\s+(?:in\s+|\()\[`[^`]+`\]\((\S+?\.py)\)", text)
+    assert found
+    for name, link in found:
+        source = (ROOT / "docs" / link).read_text(encoding="utf-8")
+        assert re.search(rf"(def|class) {name}\b|^ *{name}\b.* = ", source, re.MULTILINE), f"{name} in {link}"
 
 
 def test_notebook_is_made_from_the_tutorial():
