@@ -258,7 +258,7 @@ def test_interrupted_run_ends_cleanly(npy, scene, tmp_path, number):
 
     scene.n_frames = 12
     movie, out = npy(np.tile(scene.counts(), (80, 1, 1))), tmp_path / "out"
-    command = [sys.executable, "-m", "tract_dask.cli.main", "run", movie, out, "--workers", "1", "--shard-mb", "1"]
+    command = [sys.executable, "-m", "tract_dask.cli", "run", movie, out, "--workers", "1", "--shard-mb", "1"]
     heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs do not hear Ctrl-C
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, **pipes, text=True, preexec_fn=heard) as process:

@@ -32,7 +32,7 @@ PROCESSORS = {4: ("generic", ""), 8: ("haswell", "+avx,+avx2,+fma"), 16: ("skyla
 
 RUN = """
 import sys
-from tract_dask import pipeline
+from tract_dask.run import pipeline
 from tract_dask.settings import ConvertSettings, RunSettings
 from distributed import Client, LocalCluster
 with LocalCluster(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:

@@ -11,7 +11,8 @@ import xarray as xr
 from conftest import Scene
 
 from tract_dask.readers import open_source
-from tract_dask.settings import ConvertSettings, DriftSettings, FitSettings, RunSettings, Settings, setting
+from tract_dask.settings import ConvertSettings, DriftSettings, FitSettings, RunSettings, Settings
+from tract_dask.settings.declare import setting
 from tract_dask.stages.columns.find import find_columns
 from tract_dask.stages.convert.origin import movie_key
 from tract_dask.stages.convert.stage import convert

@@ -101,7 +101,7 @@ def run(
     source
         Any movie that :func:`tract_dask.open_source` reads.
     output
-        A folder; see :class:`Outputs`.
+        A folder; see :class:`~tract_dask.store.run_folder.RunFolder`.
     client
         The cluster to run on; None: the one that ``settings.cluster`` names, if there is anything to do.
     on_event

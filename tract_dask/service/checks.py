@@ -206,7 +206,7 @@ def _raw_bytes(shape: tuple[int, int, int], dtype: str) -> int:
 
 
 def check_source(place: str | FileList, settings: RunSettings, folder: Path | None, permit: Permit) -> Checked:
-    """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the workshop.
+    """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the pool.
 
     Its first frame is read as well, unless that is very large: some files crash their reader only then.
     """
@@ -220,7 +220,7 @@ def check_source(place: str | FileList, settings: RunSettings, folder: Path | No
 
 
 def about_movie(place: str | FileList, declared: dict[str, Any], permit: Permit) -> dict[str, Any]:
-    """Return what a movie says about itself, ready for JSON; for a process of the workshop."""
+    """Return what a movie says about itself, ready for JSON; for a process of the pool."""
     settings = from_dict(SourceSettings, {name: value for name, value in declared.items() if value is not None})
     with closing(open_source(place, settings, permit=permit)) as source:
         known = source.metadata

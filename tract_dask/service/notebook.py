@@ -287,7 +287,7 @@ class _Viewers:
 
 
 class _Here:
-    """Does in a thread what the service gives to its workshop."""
+    """Does in a thread what the service gives to its process pool."""
 
     async def run(self, function: Callable[..., T], *args: Any, **limits: Any) -> T:
         return await asyncio.to_thread(function, *args)

@@ -51,7 +51,7 @@ _END_S = 5.0
 
 
 class WorkshopError(ClusterError):
-    """The workshop is full, or a task took too long, or its worker died twice."""
+    """The pool is full, or a task took too long, or its worker died twice."""
 
 
 class _LateError(Exception):

@@ -20,7 +20,7 @@ def check_pixels(statistics: xr.Dataset, where: str) -> str | None:
     Parameters
     ----------
     statistics
-        Of the frames, as :meth:`tract_dask.Movie.statistics` gives them.
+        Of the frames, as :meth:`.Movie.statistics` gives them.
     where
         What to call the movie in errors.
 

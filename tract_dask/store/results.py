@@ -77,7 +77,7 @@ def create(
     frames_per_shard
         Frames in an inner chunk of every variable: those of a movie shard.
     about
-        Attributes under :data:`stores.ATTRIBUTE`.
+        Attributes under :data:`.metadata.ATTRIBUTE`.
     """
     sizes = {"frame": len(time), "column_id": columns.sizes["column_id"]} | schema.SIZES
     known = {"drift_measured": drift, "time": time}

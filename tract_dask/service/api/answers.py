@@ -1,4 +1,4 @@
-"""Answers that the workshop makes, and that browsers may keep: with an ETag, by what they are made from."""
+"""Answers that the process pool makes, and that browsers may keep: with an ETag, by what they are made from."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ async def kept_answer(
     about: str | Path | FileList,
     said: str = "",
 ) -> Response:
-    """Return what ``function`` makes of ``args`` in the workshop, or 304 where the client has it.
+    """Return what ``function`` makes of ``args`` in the process pool, or 304 where the client has it.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ class BodyLimit:
     Parameters
     ----------
     most
-        Bytes of a table of columns, which a process of the workshop reads.
+        Bytes of a table of columns, which a process of the pool reads.
     small
         Bytes of all others, which are read between other requests.
     """

@@ -1,8 +1,8 @@
 """The cluster that all jobs share: a process of its own that holds it, and what can be seen of its workers.
 
 The service and every job's process are clients of that cluster, and find it by a scheduler file. The process that holds
-it (:mod:`.holder`) ends when its standard input does, so that a killed service leaves nothing behind; where it dies
-itself, it is started again. A cluster that somebody else runs (kind address) needs no process, and is only looked at.
+it (:mod:`.cluster_main`) ends when its standard input does, so that a killed service leaves nothing behind; where it
+dies, it is started again. A cluster that somebody else runs (kind address) needs no process, and is only looked at.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ...settings.toml import to_dict
 
 _log = logging.getLogger(__name__)
 
-_HOLDER = f"{__package__}.holder"
+_HOLDER = f"{__package__}.cluster_main"
 _LOOK_S = 1.0
 _ANSWER_S = 5.0
 _STALE_S = 5.0

@@ -33,7 +33,7 @@ from .cluster_process import Keeper
 
 _log = logging.getLogger(__name__)
 
-COMMAND = (sys.executable, "-m", f"{__package__}.work")
+COMMAND = (sys.executable, "-m", f"{__package__}.job_main")
 """Starts a job's process."""
 
 GRACE_S = 20.0

@@ -102,7 +102,7 @@ class Scene:
 
 def scene_of(output: Path, settings: RunSettings) -> Scene:
     """Return the scene of a run into the folder ``output``."""
-    from ...store.run_folder import RunFolder  # it takes its time, and the workshop does not need it
+    from ...store.run_folder import RunFolder  # it takes its time, and the process pool does not need it
 
     places, fit = RunFolder(output), settings.fit
     return Scene(places.sum, places.columns.with_suffix(".zarr"), settings.columns, fit.blur_sigma_px, fit.window_px)

@@ -25,7 +25,7 @@ _KEPT_BYTES = 20 << 30
 
 
 class Exports:
-    """Files in other formats: each made once for the same results, in the workshop, and deleted later.
+    """Files in other formats: each made once for the same results, in the process pool, and deleted later.
 
     Parameters
     ----------

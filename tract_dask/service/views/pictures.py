@@ -1,6 +1,6 @@
 """A part of a frame, or of a summed image, as a grey picture at any zoom; and what values it has.
 
-Called in the workshop. A box is given by its edges in px; an integer coordinate is a pixel's centre, so the whole image
+Run in the process pool. A box is its edges in px; an integer coordinate is a pixel's centre, so the whole image
 is the box -0.5, -0.5, width - 0.5, height - 0.5. Zoomed out, a point of the picture is the mean over the area that it
 covers, weighted at its edges; zoomed in, it is the pixel that it lies on. What was not exposed is transparent.
 """

@@ -1,6 +1,6 @@
 """The tracks of a job, as its pages show them: numbers of columns and frames, series, displacements; as JSON.
 
-Called in the workshop. All work on a store whose fits still run: then of its finished shards. Lengths are in pm, or in
+Run in the process pool. All work on a store whose fits still run: then of its finished shards. Lengths are in pm, or in
 px where the size of a pixel is not known; what is not known is null.
 """
 

@@ -9,7 +9,7 @@ const DRAFT_MS = 400;
 export class Versions {
   constructor(editor, { list, note, unsaved, save, goOn, alone, framed }) {
     Object.assign(this, { editor, list, note, unsaved, save, goOn, alone, framed, busy: false });
-    this.key = `tract_dask.stages.columns.find.${alone ? location.pathname : editor.job}`;
+    this.key = `tract_dask.columns.${alone ? location.pathname : editor.job}`;
     save.onclick = () => this.keep();
     goOn.onclick = () => this.continue();
     goOn.hidden = framed;
