@@ -396,7 +396,7 @@ def folder(finished, tmp_path) -> Path:
 
 
 def known(fit: FitSettings | None = None, convert: ConvertSettings = SMALL, **metadata: float) -> RunSettings:
-    return RunSettings(convert=convert, metadata=MetadataSettings(**metadata), fit=fit_stage or FitSettings())
+    return RunSettings(convert=convert, metadata=MetadataSettings(**metadata), fit=fit or FitSettings())
 
 
 def run(source: Path | str, output: Path, settings: RunSettings, **more) -> tuple[set[str], list[str]]:

@@ -363,6 +363,10 @@ def test_a_finished_conversion_is_reused_but_for_its_metadata(tmp_path, source):
     assert ome["multiscales"][0]["axes"][0]["unit"] == "second"
 
 
+WRITERS = {"overwrite_array": datasets, "write_root": store_metadata}
+"""The modules that write parts of a store's metadata."""
+
+
 def cut_off(*_, **__):
     raise KeyboardInterrupt
 
@@ -372,7 +376,7 @@ def cut_off(*_, **__):
 def test_a_change_of_the_calibration_that_is_cut_off_is_ended_by_the_next_run(tmp_path, source, place, size):
     path = convert(source, tmp_path / "movie.zarr", settings=SMALL, metadata=MetadataSettings(pixel_size_pm=8.0))
     changed = MetadataSettings(pixel_size_pm=9.0)
-    real, calls = getattr(stores, place), []
+    real, calls = getattr(WRITERS[place], place), []
 
     def killed_at_the_last(*args, **more):
         calls.append(args)
@@ -381,7 +385,7 @@ def test_a_change_of_the_calibration_that_is_cut_off_is_ended_by_the_next_run(tm
         return real(*args, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stores, place, killed_at_the_last)
+        patch.setattr(WRITERS[place], place, killed_at_the_last)
         with pytest.raises(KeyboardInterrupt):
             convert(source, path, settings=SMALL, metadata=changed)
     with pytest.raises(StoreError, match="was cut off"):
@@ -407,7 +411,7 @@ def test_a_conversion_that_is_cut_off_at_its_metadata_ends_as_an_undisturbed_one
     with pytest.raises(Interrupted):
         convert(source, path, settings=SMALL, metadata=meta, on_event=act)  # all shards are there
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stores, place, cut_off)
+        patch.setattr(WRITERS[place], place, cut_off)
         with pytest.raises(KeyboardInterrupt):
             convert(source, path, settings=SMALL, metadata=meta)
     events = []

@@ -63,7 +63,7 @@ class Session:
             raise
 
     def attempt(self, work: Callable[[], Done]) -> Done:
-        """Do some work, again where this process meets an error that may pass; see :func:`tract_dask.cluster.tries.persist`."""
+        """Do some work, again where this process meets an error that may pass, see :func:`.tries.persist`."""
         return persist(work, self.send, self._started.output, lambda error: error is self._refusal)
 
     def aside(self, work: Callable[[], object]) -> None:
