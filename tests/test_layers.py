@@ -103,7 +103,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "client": ["client_answers", "jobs"],
         "auth": ["jobs", "config", "errors"],
         "metrics": ["jobs", "events"],
-        "runner": ["data_root", "crashes", "jobs", "config", "outputs", "checks"],
+        "runner": ["data_root", "crashes", "jobs", "config", "outputs", "checks", "deletion"],
         "pages": ["errors", "auth"],
         "error_handlers": ["jobs", "errors", "pages"],
         "api": ["data_root", "jobs", "errors", "checks", "deletion", "events", "views", "auth"],

@@ -19,7 +19,7 @@ from tract_dask.stages.drift.stage import estimate_drift
 from tract_dask.stages.fit import job as fit_job
 from tract_dask.stages.fit import stage as fit
 from tract_dask.store import metadata
-from tract_dask.store.processor import processor
+from tract_dask.store.provenance import processor
 
 SAME_PX = 1e-3
 """Positions; a hundredth of their errors."""
@@ -106,7 +106,7 @@ def test_whole_runs_are_the_same_at_every_width(npy, tmp_path):
 
 
 def test_a_processor_is_told_by_its_environment():
-    code = "import json; from tract_dask.store.processor import processor; print(json.dumps(processor()))"
+    code = "import json; from tract_dask.store.provenance import processor; print(json.dumps(processor()))"
     name, features = PROCESSORS[8]
     environment = os.environ | {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)

@@ -20,6 +20,7 @@ from ..store import metadata
 from ..store.columns import MOST_BYTES, parse_columns_csv
 from ..store.files import read_small
 from ..store.keys import counted
+from ..store.run_folder import COLUMNS, DRIFT, MOVIE, RESULTS, RunFolder
 from .faults import Fault
 
 _AGAIN = "Run the same command again: it writes the file anew"
@@ -27,10 +28,10 @@ _EVENTS_BYTES = 1 << 30
 _END_BYTES = 64
 
 _GROUPS: dict[str, tuple[str, dict[str, type[Settings]]]] = {
-    "movie.zarr": ("convert", {"settings": ConvertSettings, "source_settings": SourceSettings}),
-    "drift.zarr": ("drift", {"settings": DriftSettings}),
-    "columns.zarr": ("columns", {"settings": ColumnSettings}),
-    "results.zarr": ("fit", {"settings": FitSettings}),
+    MOVIE: ("convert", {"settings": ConvertSettings, "source_settings": SourceSettings}),
+    DRIFT: ("drift", {"settings": DriftSettings}),
+    COLUMNS: ("columns", {"settings": ColumnSettings}),
+    RESULTS: ("fit", {"settings": FitSettings}),
 }
 """Of a run's stores: the stage, and the settings that the store remembers, by the attribute that holds them."""
 
@@ -62,9 +63,9 @@ def look_beside(folder: Path, found: Sequence[Path]) -> Beside:
     about = {store: known for store in found if (known := _known(store))}
     tables = [store for store, known in about.items() if known.get("kind") == "columns" and known.get("complete")]
     checks: list[tuple[Path, Callable[[Path], str], str]] = [
-        (folder / "run.toml", partial(_settings, about=about), _AGAIN),
-        (folder / "events.jsonl", _events, "Remove it: it is a record that nothing needs"),
-        (folder / "report.html", _report, f"tract-dask report {folder} makes it anew"),
+        (RunFolder(folder).settings, partial(_settings, about=about), _AGAIN),
+        (RunFolder(folder).events, _events, "Remove it: it is a record that nothing needs"),
+        (RunFolder(folder).report, _report, f"tract-dask report {folder} makes it anew"),
     ]
     for store in tables:
         csv, png = store.with_suffix(".csv"), store.with_suffix(".png")
@@ -72,7 +73,7 @@ def look_beside(folder: Path, found: Sequence[Path]) -> Beside:
         checks.append((csv, partial(_table, about=about[store]), anew))
         checks.append((png, _figure, f"Remove {png} and run the same command again"))
     needed = {store.with_suffix(".csv") for store in tables}
-    needed |= {folder / "run.toml"} if (folder / "events.jsonl").exists() else set()
+    needed |= {RunFolder(folder).settings} if (RunFolder(folder).events).exists() else set()
     faults, notes, files = list[Fault](), list[str](), 0
     for file, check, remedy in checks:
         there = os.path.lexists(file)

@@ -17,13 +17,14 @@ from ..readers import open_source
 from ..readers.listing import FileList
 from ..readers.source import FrameSource, Permit
 from ..settings.run import ColumnSettings, DriftSettings, FitSettings, RunSettings
+from ..stages.columns.sites import lattice_sites
 from ..stages.columns.window_size import check_window, default_window
 from ..stages.convert.origin import check_kept, is_movie_of, remembered_source
 from ..stages.drift.stage import read_drift_csv
 from ..stages.fit.job import check_counts
 from ..stages.fit.vacuum import check_box
-from ..store import datasets, metadata
-from ..store.columns import check_inside, lattice_sites, read_columns_csv
+from ..store import metadata
+from ..store.columns import check_inside, read_columns_csv
 from ..store.movie import Movie
 from ..store.run_folder import RunFolder
 
@@ -221,7 +222,7 @@ def check_output(
     if not overwrite:
         _check_movie(outputs, source, settings)
         for path in outputs.stages()[1:]:
-            datasets.check_place(path)
+            metadata.check_place(path)
     metadata.check_destination(outputs.movie, overwrite=overwrite)
 
 

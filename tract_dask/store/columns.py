@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingsError
 from ..kernels.gaussian import parameters
-from ..stages.columns.sites import settings_lattices
 from . import schema
 from .files import read_small
 from .schema import Status
@@ -80,34 +79,7 @@ def positions(columns: xr.Dataset) -> NDArray[np.float64]:
     return np.stack([columns["x_ref"].to_numpy(), columns["y_ref"].to_numpy()], axis=1).astype(np.float64)
 
 
-def lattice_sites(lattices: Sequence[Any], shape: tuple[int, ...]) -> xr.Dataset:
-    """Return the sites of all lattices of the settings inside an image of ``shape`` (y, x), lattice by lattice.
-
-    The attribute ``spacing_px`` is the shortest of the lattices.
-
-    Raises
-    ------
-    SettingsError
-        As :func:`settings_lattices`, and where no site is inside.
-    """
-    found = settings_lattices(lattices)
-    places = np.concatenate([positions(lattice) for lattice in found])
-    kind = np.concatenate([lattice["kind"].to_numpy() for lattice in found])
-    inside = _inside(places, shape)
-    if not inside.any():
-        raise SettingsError(
-            "no site of the lattices is inside the image",
-            "setting lattices (ColumnSettings)",
-            f"positions (x, y) from 0 to {shape[1] - 1}, {shape[0] - 1}",
-            f"the first at ({places[0, 0]:g}, {places[0, 1]:g})",
-            "Give positions in px of the summed image, x to the right and y down",
-        )
-    sites = column_dataset(places[inside], kind[inside].tolist())
-    sites.attrs["spacing_px"] = min(lattice.attrs["spacing_px"] for lattice in found)
-    return sites
-
-
-def _inside(places: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def is_inside(places: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Tell which places (n, 2) of (x, y) lie on pixels of an image of ``shape`` (y, x)."""
     on_pixels = (places >= -0.5) & (places < np.array(shape[::-1]) - 0.5)
     inside: NDArray[np.bool_] = np.all(on_pixels, axis=1)
@@ -123,7 +95,7 @@ def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> Non
         With their number, and the first that does not.
     """
     places = positions(columns)
-    outside = np.flatnonzero(~_inside(places, shape))
+    outside = np.flatnonzero(~is_inside(places, shape))
     if len(outside):
         first = int(outside[0])
         x, y = places[first]

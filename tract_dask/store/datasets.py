@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import LocalStore
 
-from ..errors import DestinationError, MissingStoreError, StoreError
+from ..errors import MissingStoreError, StoreError
 from . import disk
 from .damage import CHECKED, METADATA, damaged, reading, unreadable
 from .files import disk_errors, remove
@@ -163,21 +163,3 @@ def open_lazily(path: Path, *, partial: bool = False) -> xr.Dataset:
     except (FileNotFoundError, zarr.errors.NodeNotFoundError, zarr.errors.GroupNotFoundError) as error:
         raise MissingStoreError("there is no Dataset here", str(path), remedy="Run the stage that writes it") from error
     return opened
-
-
-def check_place(path: Path) -> None:
-    """Check that nothing lies at ``path``, or a store of ours.
-
-    Raises
-    ------
-    DestinationError
-        Where it is something else.
-    """
-    if path.exists() and not attributes(path) and not (path.is_dir() and not any(path.iterdir())):
-        raise DestinationError(
-            "this place holds something else",
-            str(path),
-            "nothing, or a store of tract_dask",
-            "a folder" if path.is_dir() else "a file",
-            "Choose another place, or say --overwrite",
-        )

@@ -13,7 +13,6 @@ import numpy as np
 
 from ..errors import DestinationError, MissingStoreError, StoreError, TractError
 from .damage import METADATA, damaged, read_json
-from .datasets import check_place
 from .files import write_aside
 from .shard_files import crc32c
 
@@ -211,6 +210,24 @@ def abandon(path: Path) -> None:
     with suppress(OSError, TractError):  # on a full disk, and in what is damaged already, it is deleted all the same
         if attributes(path).get("key"):
             update_attributes(path, complete=False, key="")
+
+
+def check_place(path: Path) -> None:
+    """Check that nothing lies at ``path``, or a store of ours.
+
+    Raises
+    ------
+    DestinationError
+        Where it is something else.
+    """
+    if path.exists() and not attributes(path) and not (path.is_dir() and not any(path.iterdir())):
+        raise DestinationError(
+            "this place holds something else",
+            str(path),
+            "nothing, or a store of tract_dask",
+            "a folder" if path.is_dir() else "a file",
+            "Choose another place, or say --overwrite",
+        )
 
 
 def check_destination(path: Path, *, overwrite: bool = False) -> None:

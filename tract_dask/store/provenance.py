@@ -6,19 +6,22 @@ import hashlib
 import importlib.metadata
 import json
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
+from functools import lru_cache
 from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from llvmlite.binding import get_host_cpu_name  # type: ignore[import-untyped]
+from numba.core import config
 from numpy.typing import NDArray
 
+from ..kernels.vectors.tracing import LANES
 from ..settings.declare import Settings
 from ..settings.toml import to_toml
 from .keys import plain
-from .processor import processor
 
 ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
 """The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
@@ -114,3 +117,29 @@ def provenance(key: str, settings: Settings, source: str = "") -> dict[str, Any]
         "versions": {"python": platform.python_version()}
         | {name: importlib.metadata.version(name) for name in packages},
     }
+
+
+_LANES = " lanes"
+
+
+@lru_cache(maxsize=1)
+def processor() -> str:
+    """Return the kind of this processor, as LLVM calls it, and how many numbers the fitter's vectors hold.
+
+    Examples
+    --------
+    >>> processor().endswith(" lanes")
+    True
+    """
+    return f"{config.CPU_NAME or get_host_cpu_name()}, {LANES}{_LANES}"
+
+
+def widths(processors: Iterable[str]) -> list[int]:
+    """Return the different numbers of lanes among kinds of processors, ascending.
+
+    Examples
+    --------
+    >>> widths(["haswell, 8 lanes", "znver4, 16 lanes", "znver3, 8 lanes"])
+    [8, 16]
+    """
+    return sorted({int(kind.removesuffix(_LANES).rsplit(maxsplit=1)[-1]) for kind in processors})

@@ -18,11 +18,11 @@ from ...kernels.magnitude import unit_of
 from ...kernels.peaks import centroids, climb
 from ...settings.run import ColumnSettings
 from ...store import schema
-from ...store.columns import check_inside, column_dataset, lattice_sites, positions, read_columns_csv, write_columns_csv
+from ...store.columns import check_inside, column_dataset, positions, read_columns_csv, write_columns_csv
 from ...store.schema import Status
 from .detect import METHODS, make_detector
 from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
-from .sites import lattice_columns
+from .sites import lattice_columns, lattice_sites
 from .window_size import check_window, default_window, neighbour_distance
 
 __all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ...errors import SettingsError, shown
-from ...store.columns import column_dataset
+from ...store.columns import column_dataset, is_inside, positions
 
 MOST_SITES = 1_000_000
 """Sites of all lattices together, those outside the image counted."""
@@ -155,3 +155,30 @@ def settings_lattices(lattices: Sequence[Any]) -> list[xr.Dataset]:
         except SettingsError as error:
             raise SettingsError(error.what, where, error.expected, error.got, error.remedy) from None
     return found
+
+
+def lattice_sites(lattices: Sequence[Any], shape: tuple[int, ...]) -> xr.Dataset:
+    """Return the sites of all lattices of the settings inside an image of ``shape`` (y, x), lattice by lattice.
+
+    The attribute ``spacing_px`` is the shortest of the lattices.
+
+    Raises
+    ------
+    SettingsError
+        As :func:`settings_lattices`, and where no site is inside.
+    """
+    found = settings_lattices(lattices)
+    places = np.concatenate([positions(lattice) for lattice in found])
+    kind = np.concatenate([lattice["kind"].to_numpy() for lattice in found])
+    inside = is_inside(places, shape)
+    if not inside.any():
+        raise SettingsError(
+            "no site of the lattices is inside the image",
+            "setting lattices (ColumnSettings)",
+            f"positions (x, y) from 0 to {shape[1] - 1}, {shape[0] - 1}",
+            f"the first at ({places[0, 0]:g}, {places[0, 1]:g})",
+            "Give positions in px of the summed image, x to the right and y down",
+        )
+    sites = column_dataset(places[inside], kind[inside].tolist())
+    sites.attrs["spacing_px"] = min(lattice.attrs["spacing_px"] for lattice in found)
+    return sites

@@ -36,8 +36,7 @@ from ...store.arrays import load_array, load_saved, save_array
 from ...store.journal import Fields, Payload
 from ...store.keys import counted
 from ...store.movie import Movie
-from ...store.processor import processor
-from ...store.provenance import stage_key
+from ...store.provenance import processor, stage_key
 from ...store.shards import Shard, Shards, split
 
 Bools = NDArray[np.bool_]

@@ -19,8 +19,7 @@ from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.keys import counted
 from ...store.movie import Movie
 from ...store.parts import DamagedPartError, write
-from ...store.processor import processor, widths
-from ...store.provenance import provenance, stage_key
+from ...store.provenance import processor, provenance, stage_key, widths
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done
