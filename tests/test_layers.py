@@ -106,7 +106,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "runner": ["data_root", "crashes", "jobs", "config", "outputs", "checks", "deletion"],
         "pages": ["errors", "auth"],
         "error_handlers": ["jobs", "errors", "pages"],
-        "api": ["data_root", "jobs", "errors", "checks", "deletion", "events", "views", "auth"],
+        "api": ["data_root", "jobs", "errors", "checks", "deletion", "events", "process_pool", "views", "auth"],
         "app": [
             "jobs",
             "config",

@@ -102,8 +102,8 @@ def count_atoms(
     """
     _check_choice("frames", frames, ("each", "mean"))
     _check_choice("error", error, (*_ERRORS, "repeated"))
-    mismatch = _check_together(tracks, table)
-    levels = _levels(table, max_atoms, float(np.hypot(table_error, _WINDOW_SLOPE * mismatch)), prior)
+    shared_error = float(np.hypot(table_error, _WINDOW_SLOPE * _check_together(tracks, table)))
+    levels = _levels(table, max_atoms, shared_error, prior)
     sign = float(np.sign(table["intensity"].mean()))
     good = accepted(tracks)
     unit = _unit(tracks, vacuum)
@@ -115,13 +115,8 @@ def count_atoms(
     limit = threshold * good["noise"] * reference["area"] / unit
     weak = ((good["status"] & np.uint8(Status.BELOW_NOISE)) != 0) & ((good["status"] & np.uint8(_UNKNOWN)) == 0)
     if frames == "each":
-        inputs: tuple[xr.DataArray, ...] = (
-            intensity,
-            xr.where(weak, expected, sigma),
-            limit,
-            weak,
-            xr.ones_like(intensity),
-        )
+        error_of_each = xr.where(weak, expected, sigma)
+        inputs: tuple[Any, ...] = (intensity, error_of_each, limit, weak, xr.ones_like(intensity))
     else:
         inputs = _means(intensity, sigma, expected, limit, weak)
     probability = xr.apply_ufunc(

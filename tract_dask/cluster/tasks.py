@@ -114,11 +114,10 @@ def stream_shards(
             taken[index] = True
             take(shards[index], payload)
 
-    work = partial(_work, task, shards, journal)
-
     def tell(text: str) -> None:
         on_event(Warned(text))
 
+    work = partial(_work, task, shards, journal)
     todo = _missing(journal, shards, take_once)
     for number in range(_ROUNDS):
         if not len(todo):
@@ -135,13 +134,17 @@ def stream_shards(
                 on_done(shards[index], payload)
         todo = _lost(journal, shards, take_once, client, tell)
     if len(todo):
-        raise StoreError(
-            f"{_count(todo)} of stage {name} were written, and are not on disk as they were written",
-            str(journal.folder.parent),
-            "the files that the journal names",
-            f"none, or others, for frames {shards[todo[0]].start} to {shards[todo[0]].stop - 1}",
-            "Check this disk and its connection, and run again",
-        )
+        raise _not_on_disk(name, journal, shards, todo)
+
+
+def _not_on_disk(name: str, journal: Journal, shards: Sequence[Shard], todo: Numbers) -> StoreError:
+    return StoreError(
+        f"{_count(todo)} of stage {name} were written, and are not on disk as they were written",
+        str(journal.folder.parent),
+        "the files that the journal names",
+        f"none, or others, for frames {shards[todo[0]].start} to {shards[todo[0]].stop - 1}",
+        "Check this disk and its connection, and run again",
+    )
 
 
 def _missing(journal: Journal, shards: Sequence[Shard], take: Callable[[int, Payload], None]) -> Numbers:

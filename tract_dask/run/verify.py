@@ -199,13 +199,9 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
         faults += _damaged_parts(store, str(about.get("key")))
     bad = sum(fault.what != "left over" for fault in faults)
     on_event(StageDone(store.name, perf_counter() - began, summary=f"{bad} faults" if bad else "sound"))
-    plain = metadata.format_of(about) < metadata.FORMAT
-    return Verified(
-        tuple(faults),
-        len(names) + 1 + len(files),
-        () if about.get("complete", True) else (store,),
-        (store,) if plain else (),
-    )
+    unfinished = () if about.get("complete", True) else (store,)
+    plain = (store,) if metadata.format_of(about) < metadata.FORMAT else ()
+    return Verified(tuple(faults), len(names) + 1 + len(files), unfinished, plain)
 
 
 def _damaged_parts(store: Path, key: str) -> list[Fault]:

@@ -44,21 +44,21 @@ def _operation_id(route: APIRoute) -> str:
     return route.name
 
 
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    app.state.runner.start()
+    app.state.workshop.start()
+    try:
+        yield
+    finally:
+        app.state.feed.close()
+        await app.state.upstream.close()
+        app.state.runner.stop()
+        app.state.workshop.close()
+
+
 def create_app(config: ServiceConfig) -> FastAPI:
     """Return the application; its runner starts and stops with it."""
-
-    @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.state.runner.start()
-        app.state.workshop.start()
-        try:
-            yield
-        finally:
-            app.state.feed.close()
-            await app.state.upstream.close()
-            app.state.runner.stop()
-            app.state.workshop.close()
-
     app = FastAPI(
         title="tract_dask",
         version=version("tract_dask"),
@@ -66,7 +66,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         docs_url=None,  # it loads scripts from elsewhere
         redoc_url=None,
         generate_unique_id_function=_operation_id,
-        lifespan=lifespan,
+        lifespan=_lifespan,
     )
     config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
     app.state.config, app.state.root = config, config.root

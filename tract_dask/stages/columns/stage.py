@@ -59,14 +59,8 @@ def columns_stage(
     window, blur = fit_settings.window_px, fit_settings.blur_sigma_px
     find = partial(find_columns, summed, window_px=window, blur_sigma_px=blur)
     before = _Table.read(csv, settings)
-    if before.is_foreign and not overwrite:
-        raise DestinationError(
-            "this table was not written by tract-dask",
-            str(csv),
-            "nothing, or a table of an earlier run",
-            "another file",
-            "Choose another place, say --overwrite, or give the table as --columns",
-        )
+    if not overwrite:
+        before.check_ours()
     counts = counted("columns", columns=settings, fit=fit_settings)
     key = _columns_key(summed, counts, before.seeds)
     about, pixel_size = before.about, summed.attrs.get("pixel_size_pm")
@@ -166,6 +160,17 @@ class _Table:
     def is_foreign(self) -> bool:
         """Whether it is none that a run has written."""
         return bool(self.content) and not self.about and not self.content.startswith(_OUR_TABLE) and not self.is_given
+
+    def check_ours(self) -> None:
+        """Refuse a table of other origin."""
+        if self.is_foreign:
+            raise DestinationError(
+                "this table was not written by tract-dask",
+                str(self.csv),
+                "nothing, or a table of an earlier run",
+                "another file",
+                "Choose another place, say --overwrite, or give the table as --columns",
+            )
 
     @property
     def is_edited(self) -> bool:

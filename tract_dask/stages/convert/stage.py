@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from distributed import Client
+from numpy.typing import NDArray
 
 from ...cluster.tasks import stream_shards
 from ...errors import ChangedSourceError, DestinationError, SourceError, StoreError
@@ -111,22 +112,31 @@ def convert(
         on_event(announce(done_frames=n_frames))
         on_event(StageDone(STAGE, time.perf_counter() - started, reused=True, summary="already converted"))
         return path
-
     layout = plan_layout(movie.shape, movie.dtype, settings)
     shards = split(n_frames, layout.frames_per_shard)
     _check_destination(path, movie, settings, source_settings, overwrite=overwrite)
     workers = client() if callable(client) else client
     journal = _begun(path, movie, known, layout, settings, source_settings, on_event)
     on_event(announce(done_frames=journal.frames_done(shards)))
-    statistics = {name: np.empty(n_frames) for name in schema.STATISTICS}
+    stamps = origin_of(movie).stamps
+    job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, stamps, movie.permit)
+    finalise(path, _write_shards(movie, job, shards, journal, workers, on_event), known)
+    journal.remove()
+    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
+    return path
+
+
+def _write_shards(
+    movie: FrameSource, job: Job, shards: Sequence[Shard], journal: Journal, workers: Client | None, on_event: Sink
+) -> dict[str, NDArray[np.float64]]:
+    """Write the shards that the journal does not know; return the statistics (frames,) of all frames by name."""
+    statistics = {name: np.empty(movie.shape[0]) for name in schema.STATISTICS}
 
     def keep(shard: Shard, payload: Payload) -> None:
         for name, values in statistics.items():
             values[shard.start : shard.stop] = payload[name]
 
-    origin = origin_of(movie)
-    job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, origin.stamps, movie.permit)
-    with _unchanged(path, movie, origin):
+    with _unchanged(job.path, movie, origin_of(movie)):
         stream_shards(
             partial(convert_shard, job),
             shards,
@@ -138,10 +148,7 @@ def convert(
             file=movie.path,
             on_event=on_event,
         )
-    finalise(path, statistics, known)
-    journal.remove()
-    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
-    return path
+    return statistics
 
 
 def _begun(

@@ -65,13 +65,7 @@ def fit_movie(
         results.calibrate(path, frame_times(movie), **calibration(movie))
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
-    goes_on = about.get("key") == key
-    if not goes_on:
-        remove_journal(journal_beside(path))
-    elif damage := results.damage(path):
-        goes_on = False
-        on_event(Warned(f"{damage.where} is damaged: the store is made anew, with the fits that are done"))
-    if not goes_on:
+    if not _goes_on(path, key, on_event):
         results.create(
             path,
             columns,
@@ -106,6 +100,17 @@ def fit_movie(
         StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
     )
     return FitSummary(**summary)
+
+
+def _goes_on(path: Path, key: str, on_event: Sink) -> bool:
+    """Tell whether the unfinished store at ``path`` can be gone on with; fits with another key are thrown away."""
+    if metadata.attributes(path).get("key") != key:
+        remove_journal(journal_beside(path))
+        return False
+    if damage := results.damage(path):
+        on_event(Warned(f"{damage.where} is damaged: the store is made anew, with the fits that are done"))
+        return False
+    return True
 
 
 def _fit_shards(
