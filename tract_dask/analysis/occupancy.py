@@ -6,6 +6,8 @@ follow by Bayes' rule.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
