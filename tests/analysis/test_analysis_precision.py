@@ -13,7 +13,7 @@ from tract_dask.kernels.gaussian.fit import fit_gaussians
 from tract_dask.kernels.gaussian.information import column_bounds
 from tract_dask.kernels.gaussian.model import blurred, gaussian_image
 from tract_dask.kernels.gaussian.parameters import AMPLITUDE, PARAMETERS, SIGMA_A, SIGMA_B
-from tract_dask.settings import MetadataSettings
+from tract_dask.settings import FitSettings, MetadataSettings
 from tract_dask.store import schema
 from tract_dask.store.schema import Status
 
@@ -249,7 +249,9 @@ def test_fits_reach_the_bound_at_every_dose(tmp_path, npy, scene):
             npy(scene.counts()), tmp_path / "movie.zarr", metadata=MetadataSettings(pixel_size_pm=PIXEL_PM, dose=125.0)
         )
     )
-    series = fit_doses(movie, scene.columns(), scene.drift_dataset(), groups=(1, 4), refine_columns=None)
+    series = fit_doses(
+        movie, scene.columns(), scene.drift_dataset(), groups=(1, 4), settings=FitSettings(refine_drift=False)
+    )
     table = precision_table(series, columns=scene.columns()["column_id"].to_numpy())
     assert table["dose"].to_numpy().tolist() == [125.0, 500.0]
     truth = np.array([*scene.parameters[0, :1], 9.0, 9.0, *scene.parameters[0, 3:]])

@@ -169,7 +169,9 @@ def test_drifting_frames_are_aligned_before_they_are_summed(scene, make_movie):
     scene.__post_init__()
     scene.drift[:] = np.linspace(-6, 6, 24)[:, None] * [0.7, 1.0]
     frames = np.array([scene.frame(shift) for shift in scene.drift], dtype=np.float32)
-    (tracks,) = fit_doses(make_movie(frames), scene.columns(), scene.drift_dataset(), groups=[6], refine_columns=None)
+    (tracks,) = fit_doses(
+        make_movie(frames), scene.columns(), scene.drift_dataset(), groups=[6], settings=FitSettings(refine_drift=False)
+    )
     away = tracks["fit"].sel(parameter=["x", "y"]).to_numpy() - scene.place
     assert np.abs(away).max() <= 1e-2  # neighbours' tails, as in the frames themselves
 
@@ -178,7 +180,9 @@ def test_precision_grows_with_the_square_root_of_the_dose(scene, make_movie):
     scene.n_frames = 48
     scene.__post_init__()
     movie = make_movie(scene.counts())
-    doses = fit_doses(movie, scene.columns(), scene.drift_dataset(), groups=(1, 4), refine_columns=None)
+    doses = fit_doses(
+        movie, scene.columns(), scene.drift_dataset(), groups=(1, 4), settings=FitSettings(refine_drift=False)
+    )
     few, many = (tracks["fit"].sel(parameter=["x", "y"]).to_numpy() - scene.place for tracks in doses)
     assert few.std() / many.std() == pytest.approx(2.0, rel=0.12)  # 384 values in the second: known to 4 %
     slopes = [float(tracks["fit"].sel(parameter="amplitude").mean()) for tracks in doses]

@@ -17,7 +17,7 @@ from tract_dask.analysis.intensity import (
 )
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.gaussian.intensity import intensities
-from tract_dask.settings import MetadataSettings
+from tract_dask.settings import FitSettings, MetadataSettings
 from tract_dask.store import schema
 from tract_dask.store.schema import Status
 
@@ -104,7 +104,7 @@ def test_intensities_of_counts_scatter_as_the_fits_say(scene, make_movie):
     scene.n_frames = 40
     scene.__post_init__()
     movie = make_movie(scene.counts())
-    tracks = fit_columns(movie, scene.columns(), scene.drift_dataset(), refine_columns=None).compute()
+    tracks = fit_columns(movie, scene.columns(), scene.drift_dataset(), FitSettings(refine_drift=False)).compute()
     errors = repeated_error(tracks)
     volume = PAPER * 2 * np.pi * scene.amplitude * scene.sigma_a * scene.sigma_b
     assert float(errors["mean"].mean()) == pytest.approx(volume, rel=0.02)
@@ -180,7 +180,7 @@ def test_each_frame_has_its_own_vacuum(scene, make_movie):
     scene.__post_init__()
     frames = np.array([k * scene.frame(shift) for k, shift in zip(beam, scene.drift, strict=True)], np.float32)
     movie, drift = make_movie(frames), scene.drift_dataset()
-    tracks = fit_columns(movie, scene.columns(), drift, refine_columns=None)
+    tracks = fit_columns(movie, scene.columns(), drift, FitSettings(refine_drift=False))
     found = normalised(tracks, vacuum_level(movie, (8, 40, 10, 130), drift=drift))
     assert found["intensity"].chunks is not None
     assert float(tracks["intensity"].std("frame").mean() / tracks["intensity"].mean()) > 0.3
@@ -221,7 +221,13 @@ def test_normalised_intensity_does_not_depend_on_the_dose_and_its_error_falls_wi
     scene.n_frames = 48
     scene.__post_init__()
     groups = (4, 1)
-    series = fit_doses(make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), groups, refine_columns=None)
+    series = fit_doses(
+        make_movie(scene.counts()),
+        scene.columns(),
+        scene.drift_dataset(),
+        groups,
+        settings=FitSettings(refine_drift=False),
+    )
     table = intensity_against_dose(series, [2, 3, 5], vacuum=[n * scene.background for n in groups])
     assert table["dose"].to_numpy().tolist() == [125.0, 500.0]
     assert table["column_id"].to_numpy().tolist() == [2, 3, 5]

@@ -97,7 +97,7 @@ def test_options_override_the_configuration(captured, tmp_path):
         (("--columns", "a.csv"), "columns", {"method": "csv", "csv": "a.csv"}),
         (("--drift-csv", "d.csv"), "drift", {"method": "csv", "csv": "d.csv"}),
         (("--no-drift",), "drift", {"method": "none"}),
-        (("--no-drift-refine",), "drift", {"refine": False}),
+        (("--no-refine-drift",), "fit", {"refine_drift": False}),
         (("--lattices", "[{origin = [1, 2]}]"), "columns", {"method": "lattice", "lattices": ({"origin": [1, 2]},)}),
         (("--raw-shape", "0,64,32", "--raw-dtype", "u2"), "source", {"raw_shape": (0, 64, 32), "raw_dtype": "u2"}),
         (("--workers", "3", "--memory-limit", "2GB"), "cluster", {"workers": 3, "memory_limit": "2GB"}),

@@ -125,7 +125,7 @@ def test_second_run_does_nothing_and_starts_no_cluster(done, scene, monkeypatch)
     [
         ({"fit": {"threshold": 3.0}}, {"fit"}),
         ({"fit": {"window_px": 21}}, {"columns", "fit"}),
-        ({"drift": {"refine": False}}, {"fit"}),
+        ({"fit": {"refine_drift": False}}, {"fit"}),
         ({"columns": {"min_amplitude": 0.2}}, {"columns"}),
         ({"columns": {"search_radius_px": 0.0}}, {"columns"}),
         ({"drift": {"method": "none"}}, {"drift", "sum", "columns", "fit"}),

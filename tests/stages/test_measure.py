@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,7 +40,7 @@ def position_bound(scene) -> float:
 
 def test_positions_and_shapes_match_the_truth(scene, make_movie):
     tracks = fit_columns(
-        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), FREE, refine_columns=None
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), replace(FREE, refine_drift=False)
     ).compute()
     away = tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place
     assert away.std() <= 1.3 * position_bound(scene)
@@ -52,7 +54,7 @@ def test_positions_and_shapes_match_the_truth(scene, make_movie):
 def test_centroids_are_nearly_as_good_as_fits(scene, make_movie):
     """Drift-corrected, unbiased, and at most 1.3 times the bound: a mask of the best radius loses 13 % at least."""
     tracks = fit_columns(
-        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), refine_columns=None
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), FitSettings(refine_drift=False)
     ).compute()
     away = tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place
     assert away.std() <= 1.3 * position_bound(scene)
@@ -65,7 +67,7 @@ def test_centroids_are_not_masked_but_where_there_is_no_window_or_frame(scene, m
     frames = scene.counts().astype(np.float32)
     frames[7, 0, 0] = np.nan
     tracks = fit_columns(
-        make_movie(frames), scene.columns(), scene.drift_dataset(), FitSettings(threshold=100), refine_columns=None
+        make_movie(frames), scene.columns(), scene.drift_dataset(), FitSettings(threshold=100, refine_drift=False)
     ).compute()
     masked = accepted(tracks)
     assert masked.fit.isnull().all()
@@ -86,7 +88,9 @@ def test_a_small_mask_is_noisier(scene, make_movie):
     spread = {}
     for radius in (None, 3.0):
         settings = FitSettings(mask_radius_px=radius)
-        tracks = fit_columns(movie, scene.columns(), scene.drift_dataset(), settings, refine_columns=None).compute()
+        tracks = fit_columns(
+            movie, scene.columns(), scene.drift_dataset(), replace(settings, refine_drift=False)
+        ).compute()
         spread[radius] = (tracks.centroid.sel(axis=["x", "y"]).to_numpy() - scene.place).std()
     assert spread[3.0] > 1.3 * spread[None]
 
@@ -95,7 +99,9 @@ def test_positions_do_not_depend_on_the_drift(scene, make_movie):
     """Windows move with the drift: a still scene and a drifting one give the same positions, noise-free, to 1e-3 px."""
     scene.drift = scene.drift + 0.37
     frames = np.array([scene.frame(shift) for shift in scene.drift], dtype=np.float32)
-    tracks = fit_columns(make_movie(frames), scene.columns(), scene.drift_dataset(), refine_columns=None).compute()
+    tracks = fit_columns(
+        make_movie(frames), scene.columns(), scene.drift_dataset(), FitSettings(refine_drift=False)
+    ).compute()
     away = tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place
     assert np.abs(away).max() <= 1e-2  # neighbours' tails bias a column, the same in every frame
     assert away.std(axis=0).max() <= 1e-3
@@ -104,7 +110,7 @@ def test_positions_do_not_depend_on_the_drift(scene, make_movie):
 def test_common_motion_refines_the_drift(scene, make_movie):
     error = np.random.default_rng(3).normal(0, 0.5, (scene.n_frames, 2))
     tracks = fit_columns(
-        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(error), refine_columns=8
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(error), FitSettings(refine_columns=8)
     ).compute()
     left = tracks.drift.to_numpy() - scene.drift
     left -= left.mean(axis=0)
@@ -117,7 +123,7 @@ def test_common_motion_refines_the_drift(scene, make_movie):
 def test_too_few_columns_leave_the_drift_alone(scene, make_movie):
     drift = scene.drift_dataset()
     tracks = fit_columns(
-        make_movie(scene.counts()), scene.columns(), drift, refine_columns=len(scene.place) + 1
+        make_movie(scene.counts()), scene.columns(), drift, FitSettings(refine_columns=len(scene.place) + 1)
     ).compute()
     np.testing.assert_array_equal(tracks.drift, drift.drift)
 
@@ -128,7 +134,7 @@ def test_absent_columns_are_flagged(scene, make_movie):
     summed = scene.summed()
     movie = make_movie(scene.counts(present))
     tracks = fit_columns(
-        movie, scene.columns(), scene.drift_dataset(), FitSettings(threshold=6), summed=summed, refine_columns=None
+        movie, scene.columns(), scene.drift_dataset(), FitSettings(threshold=6, refine_drift=False), summed=summed
     ).compute()
     lost = tracks.status.to_numpy() != 0
     assert lost[~present].all()
@@ -139,7 +145,7 @@ def test_a_sigma_on_its_bound_is_flagged_and_accepted(scene, make_movie):
     columns = scene.columns()
     columns["fit_ref"][:, [3, 4]] *= 0.6  # the true widths are beyond 1.3 times these
     tracks = fit_columns(
-        make_movie(scene.counts()), columns, scene.drift_dataset(), FREE, refine_columns=None
+        make_movie(scene.counts()), columns, scene.drift_dataset(), replace(FREE, refine_drift=False)
     ).compute()
     assert (tracks.status == Status.SHAPE_AT_BOUND).mean() > 0.95
     assert accepted(tracks).fit.sel(parameter="x").notnull().mean() > 0.95
@@ -159,7 +165,7 @@ def test_noise_is_that_of_blurred_vacuum(scene, make_movie):
 def test_columns_that_leave_the_frame_keep_their_place_in_the_table(scene, make_movie):
     scene.drift[5] = (0, -18)
     tracks = fit_columns(
-        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), refine_columns=None
+        make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), FitSettings(refine_drift=False)
     ).compute()
     gone = scene.place[:, 0] - 18 < 19 // 2 - 0.5
     assert gone.any()

@@ -220,7 +220,6 @@ def fit_doses(
     settings: FitSettings | None = None,
     *,
     summed: xr.Dataset | None = None,
-    refine_columns: int | None = 10,
 ) -> list[xr.Dataset]:
     """Fit every column of one movie at several doses a frame, lazily: in sums of 1, 2, 4 … frames.
 
@@ -228,7 +227,7 @@ def fit_doses(
     ----------
     groups
         Frames in a sum, one number for each Dataset.
-    movie, columns, drift, settings, summed, refine_columns
+    movie, columns, drift, settings, summed
         As :func:`tract_dask.fit_columns` takes them for the movie itself.
 
     Returns
@@ -247,11 +246,7 @@ def fit_doses(
     for n in groups:
         sums = rebin_frames(movie, n, drift)
         brighter = None if summed is None else summed.assign(image=n * summed["image"])
-        tracks.append(
-            fit_columns(
-                sums, _brighter(columns, n), sums.drift, settings, summed=brighter, refine_columns=refine_columns
-            )
-        )
+        tracks.append(fit_columns(sums, _brighter(columns, n), sums.drift, settings, summed=brighter))
     return tracks
 
 

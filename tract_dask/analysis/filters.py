@@ -89,7 +89,7 @@ def compare_filters(
     settings = dataclasses.replace(settings or FitSettings(), estimator="lsq", shape="free")
     parts = []
     for name in FILTERS:
-        job = prepare(movie, columns, drift, dataclasses.replace(settings, filter=name), refine_columns=None)
+        job = prepare(movie, columns, drift, dataclasses.replace(settings, filter=name, refine_drift=False))
         measured = [_frame_rows(measure_frame(movie, frame, job)) for frame in frames]
         parts.append(xr.concat(measured, "frame").assign_coords(column_id=known).sel(column_id=chosen))
     compared = xr.concat(parts, xr.IndexVariable("filter", list(FILTERS)))

@@ -127,7 +127,7 @@ def columns(
 @click.argument("results", type=PATH)
 @drift_option
 @common_options
-@setting_options("fit", "columns.contrast", "drift.refine", "drift.refine_columns", "cluster")
+@setting_options("fit", "columns.contrast", "cluster")
 def fit(
     movie: Path, columns: Path, results: Path, settings: RunSettings, *, drift_from: Path | None, as_json: bool
 ) -> None:

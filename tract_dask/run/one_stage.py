@@ -26,7 +26,6 @@ from ..store.movie import Movie, open_movie
 from ..store.run_folder import sum_beside
 from ..store.schema import drift_of
 from .checks import check_columns, check_drift, check_fit, check_pixels_of, check_suffix, open_input, with_whole_paths
-from .pipeline import refine_columns_of
 from .plan import plan_run
 from .session import Session, draw_columns
 
@@ -115,5 +114,4 @@ def run_fit(
         summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), workers, send))
         csv = path.with_name(f"{path.stem}_columns.csv")
         found = attempt(partial(columns_stage, summed, csv, chosen, settings.fit, send, draw=draw_columns))
-        refine = refine_columns_of(settings)
-        return attempt(partial(fit_stage, opened, found, shift, summed, path, settings.fit, refine, workers, send))
+        return attempt(partial(fit_stage, opened, found, shift, summed, path, settings.fit, workers, send))

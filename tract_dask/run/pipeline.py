@@ -223,9 +223,8 @@ def _stages(
     find = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send, draw=draw)
     made.columns = columns = attempt(find)
     yield "columns"
-    refine = refine_columns_of(settings)
     made.summary = attempt(
-        partial(fit_stage, movie, columns, drift, summed, outputs.results, settings.fit, refine, workers, send)
+        partial(fit_stage, movie, columns, drift, summed, outputs.results, settings.fit, workers, send)
     )
     yield "fit"
 
@@ -250,11 +249,6 @@ def _report(outputs: RunFolder, session: Session) -> None:
         files.remove(outputs.report)  # it would be of other tracks
         send(Warned(f"the report could not be made: {error}"))
     send(StageDone(REPORT, perf_counter() - began, reused=current))
-
-
-def refine_columns_of(settings: RunSettings) -> int | None:
-    """Return how many columns refine the drift; None where it is not refined."""
-    return settings.drift.refine_columns if settings.drift.refine and settings.drift.method != "none" else None
 
 
 def clear_run(outputs: RunFolder, on_event: Sink = silent, *, keep_edited: bool = False) -> None:

@@ -68,12 +68,6 @@ class DriftSettings(Settings):
         low=0.5,
         flag="--drift-search-px",
     )
-    refine: bool = setting(
-        True,
-        "Correct the drift of each frame by the common motion of its fitted columns",
-        flag="--drift-refine",
-    )
-    refine_columns: int = setting(10, "Fewest accepted columns of a frame for that correction", low=3)
 
 
 @dataclass(frozen=True)
@@ -206,6 +200,8 @@ class FitSettings(Settings):
         1e-4, "A fit has converged when its position moves less than this", unit="px", low=1e-8, high=0.1
     )
     max_iterations: int = setting(50, "Most iterations of one fit", low=1, high=10000)
+    refine_drift: bool = setting(True, "Correct the drift of each frame by the common motion of its fitted columns")
+    refine_columns: int = setting(10, "Fewest accepted columns of a frame for that correction", low=3)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -90,8 +90,8 @@ OTHERWISE = {
     "metadata.dose": "written down, in no key",
     "metadata.gain": "the movie's gain is in the keys of sum and fit",
     "drift.csv": "the file's contents are in the key of drift",
-    "drift.refine": "fewest columns that refine, or none, are in the key of fit",
-    "drift.refine_columns": "fewest columns that refine, or none, are in the key of fit",
+    "fit.refine_drift": "fewest columns that refine, or none, are in the key of fit",
+    "fit.refine_columns": "fewest columns that refine, or none, are in the key of fit",
     "columns.csv": "the file's contents are in the key of columns",
     "fit.window_px": "the window that is fitted is in the key of fit",
     "fit.vacuum_box": "the box that is looked at is in the key of fit",
@@ -110,7 +110,7 @@ def counted(stage: str, **groups: Settings) -> dict[str, Any]:
     Examples
     --------
     >>> from tract_dask.settings import DriftSettings
-    >>> counted("drift", drift=DriftSettings(search_px=12, refine=False))
+    >>> counted("drift", drift=DriftSettings(search_px=12, method="auto"))
     {'drift.search_px': 12.0}
     """
     values = ((item, item.value(groups)) for item in KEYED[stage])

@@ -20,16 +20,16 @@ def common_motion(fits: GaussianFits, status: NDArray[np.uint8], drift: Floats, 
 
     Zero unless it stands out of its own error with 99.9 % certainty (chi-squared of both axes above 13.8):
     registration, which sees every pixel, is otherwise the better estimate. Zero, too, where fewer than
-    ``refine_columns`` are accepted.
+    ``job.refined_by`` are accepted.
     """
     motion = np.zeros_like(drift)
-    if job.refine_columns is None:
+    if job.refined_by is None:
         return motion
     away = fits.estimates[..., [Y, X]] - drift[:, None] - job.reference[:, [Y, X]]
     expected = np.sqrt(np.abs(job.reference[:, BACKGROUND]) + np.abs(job.reference[:, AMPLITUDE]) / 2)
     expected /= np.abs(job.reference[:, AMPLITUDE]) + 1e-12
     good = (status & REJECTED) == 0
-    enough = good.sum(axis=1) >= job.refine_columns
+    enough = good.sum(axis=1) >= job.refined_by
     if enough.any():
         common, error = _biweight(away[enough], expected, good[enough])
         certain = ((common / error) ** 2).sum(axis=1) > CERTAIN

@@ -42,7 +42,7 @@ class Job:
         Side of the windows in px.
     vacuum
         (y0, y1, x0, x1) in the summed image, or None: noise is taken from the residuals.
-    refine_columns
+    refined_by
         Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured.
     """
 
@@ -51,7 +51,7 @@ class Job:
     bad: NDArray[np.bool_]
     window: int
     vacuum: tuple[int, ...] | None
-    refine_columns: int | None
+    refined_by: int | None
     settings: FitSettings
 
     @cached_property
@@ -81,7 +81,6 @@ def prepare(
     settings: FitSettings,
     *,
     summed: xr.Dataset | None = None,
-    refine_columns: int | None = 10,
 ) -> Job:
     """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
     schema.validate(columns, schema.COLUMNS, "columns")
@@ -99,8 +98,9 @@ def prepare(
     if settings.estimator == "poisson":
         check_counts(statistics["frame_min"].to_numpy())
     blur = columns.attrs.get("blur_sigma_px", settings.blur_sigma_px)
-    refine = refine_columns if drift is not None else None
-    return Job(_reference(columns, blur, settings), shift, bad, window, box, refine, settings)
+    measured = drift is not None and drift.attrs.get("method") != "none"
+    refined_by = settings.refine_columns if settings.refine_drift and measured else None
+    return Job(_reference(columns, blur, settings), shift, bad, window, box, refined_by, settings)
 
 
 def check_counts(smallest: Floats) -> None:

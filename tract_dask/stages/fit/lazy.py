@@ -24,7 +24,6 @@ def fit_columns(
     settings: FitSettings | None = None,
     *,
     summed: xr.Dataset | None = None,
-    refine_columns: int | None = 10,
 ) -> xr.Dataset:
     """Fit every column in every frame, lazily: the Dataset computes what is asked of it, shard by shard.
 
@@ -41,8 +40,6 @@ def fit_columns(
     summed
         From :func:`tract_dask.sum_image`; the vacuum for the noise is looked for in it. Without it, and without
         ``settings.vacuum_box``, the noise of a frame is the rms residual of its fits.
-    refine_columns
-        Fewest accepted columns that may refine a frame's drift by their common motion; None: never.
 
     Returns
     -------
@@ -58,7 +55,7 @@ def fit_columns(
     """
     import dask.array as da  # takes its time, and workers do not need it
 
-    job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed, refine_columns=refine_columns)
+    job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed)
     n_columns = len(job.reference)
     names = [name for name in schema.RESULTS if name not in ("time", "drift_measured")]
     sizes = {"frame": movie.n_frames, "column_id": n_columns} | schema.SIZES

@@ -77,7 +77,7 @@ def fit_movie(
             window=job.window,
             vacuum=job.vacuum,
             reference_blur_px=columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px),
-            refine_columns=job.refine_columns,
+            refine_columns=job.refined_by,
         )
     journal = Journal(journal_beside(path), key, dict.fromkeys(_COUNTS, ()))
     done_frames = journal.frames_done(movie.shards)
@@ -142,7 +142,7 @@ def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
     """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
     arrays = (job.reference, job.drift, columns["column_id"].to_numpy().astype(np.int64))
     vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
-    numbers = [movie.gain, int(job.window), vacuum, job.refine_columns]
+    numbers = [movie.gain, int(job.window), vacuum, job.refined_by]
     kinds = [str(kind) for kind in columns["kind"].to_numpy()]
     return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
 
@@ -167,11 +167,10 @@ def fit_stage(
     summed: xr.Dataset | None,
     path: Path,
     settings: FitSettings,
-    refine_columns: int | None,
     workers: Workers,
     on_event: Sink = silent,
 ) -> FitSummary:
     """Fit every column in every frame into ``path``."""
-    job = prepare(movie, columns, drift, settings, summed=summed, refine_columns=refine_columns)
+    job = prepare(movie, columns, drift, settings, summed=summed)
     client = None if is_done(path, fit_key(movie, columns, job)) else workers()
     return fit_movie(movie, columns, job, path, client=client, on_event=on_event)

@@ -6,8 +6,8 @@ import { h, setAttribute, setText } from "./dom.js";
 const ONLY_WITH = {
   "drift.csv": (value) => value("drift.method") === "csv",
   "drift.search_px": (value) => value("drift.method") === "auto",
-  "drift.refine": (value) => value("drift.method") !== "none",
-  "drift.refine_columns": (value) => value("drift.method") !== "none" && value("drift.refine"),
+  "fit.refine_drift": (value) => value("drift.method") !== "none",
+  "fit.refine_columns": (value) => value("drift.method") !== "none" && value("fit.refine_drift"),
   "columns.csv": (value) => value("columns.method") === "csv",
   "columns.lattices": (value) => value("columns.method") === "lattice",
   "columns.template": (value) => value("columns.method") === "template",
