@@ -151,7 +151,7 @@ def test_vacuum_of_a_summed_image_is_found(scene):
 def test_vacuum_that_cannot_be_had(scene, make_movie):
     with pytest.raises(SettingsError, match="no vacuum is known"):
         vacuum_level(scene.summed())
-    with pytest.raises(SettingsError, match=r"vacuum_level: box.*leaves frame"):
+    with pytest.raises(SettingsError, match=r"vacuum_level: box.*leaves the frame"):
         vacuum_level(scene.summed(), (0, 1000, 0, 10))
     with pytest.raises(SettingsError, match="vacuum of a movie needs its box"):
         vacuum_level(make_movie(scene.counts()))
