@@ -20,10 +20,8 @@ from typing import Any, Self, TypeAlias
 STAGES = ("convert", "drift", "sum", "columns", "fit")
 """The stages of a run, in their order."""
 
-
 REPORT = "report"
 """What a run makes after its stages."""
-
 
 _APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0)
 
@@ -89,7 +87,6 @@ class RunDone:
 
 
 Event: TypeAlias = RunStarted | StageStarted | ShardDone | StageDone | Warned | RunDone
-
 
 Sink: TypeAlias = Callable[[Event], None]
 

@@ -25,7 +25,6 @@ from ..store.schema import Status
 FILTERS = ("none", "gaussian", "wiener", "tv-l1")
 """In the order of the paper's table; the first is what the others are compared with."""
 
-
 TABLE = (
     "frame",
     "filter",
@@ -39,7 +38,6 @@ TABLE = (
     "intensity_difference",
 )
 """The columns of the table, as in the paper; positions in px of the frame, intensities in counts and per cent."""
-
 
 _MARGIN = 0.75
 """Of a region beyond its outermost columns, in units of their windows."""

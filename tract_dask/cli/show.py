@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-
 PATH = click.Path(path_type=Path)
-
 
 DEBUG = "tract_dask.debug"
 """Key of click's context under which ``--debug`` is kept."""
@@ -65,7 +63,6 @@ def show(found: dict[str, Any], *, as_json: bool) -> None:
 
 FAILED, BAD_FRAMES = 1, 3
 """Exit codes beside 0, 2 for usage or bad input, and that of an interrupt."""
-
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Begin anew, whatever is there.")
 

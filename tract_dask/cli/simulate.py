@@ -15,9 +15,7 @@ from .show import PATH, Subgroup, common_options, show
 
 pixel_option = click.option("--pixel-size-pm", default=4.0, show_default=True, metavar="PM", help="Size of a pixel.")
 
-
 specimen_options = class_options(SpecimenSettings, "specimen", "Specimen")
-
 
 microscope_options = class_options(Microscope, "microscope", "Microscope", presets=PRESETS)
 

@@ -27,7 +27,6 @@ from ..progress import (
 
 _PLAIN_INTERVAL_S = 10.0
 
-
 _ENDS = {
     "done": "done",
     "done_with_bad_frames": "done, with frames that could not be fitted",

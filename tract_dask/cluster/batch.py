@@ -17,10 +17,8 @@ from .tries import Place, Trouble, trouble
 BATCH_S = 0.5
 """For so long a task goes on taking shards of its batch; a longer shard is a batch of its own."""
 
-
 Numbers: TypeAlias = NDArray[np.int64]
 """Indices of shards."""
-
 
 Work: TypeAlias = Callable[[Numbers], tuple[list[Payload], float]]
 

@@ -13,19 +13,14 @@ from distributed import Client
 PATIENCE = "tract_dask.patience-s"
 """Item of Dask's configuration: for how long, in s, work waits while the cluster has no worker."""
 
-
 HANG = "tract_dask.hang-s"
 """Item of Dask's configuration: a batch that takes so long, in s, and :data:`SLOW` times the longest, seems to hang."""
 
-
 PATIENCE_S, HANG_S = 60.0, 60.0
-
 
 LEFT_OUT_S = 300.0
 
-
 RESTART_S = 60
-
 
 MOST_SWOLLEN, MOST_LOST = 4, 10
 """So often a shard may lose its worker to its memory limit, and in other ways that say nothing of its data."""

@@ -32,28 +32,21 @@ from .tries import Rows, Trouble, is_hopeless, places_to_avoid, wait_s
 SLOW = 20
 """So many times as long as the longest batch so far is too long; while there is none, five times :data:`HANG`."""
 
-
 JOB = "tract_dask.job"
 """Item of Dask's configuration: the job that work is part of, to be named with its tasks."""
-
 
 _SETTLE_S = 15.0
 """For so long an interrupted run waits for the tasks that are being executed."""
 
-
 _TICK_S, _LOOK_S = 0.25, 1.0
-
 
 _FETCH_S = 5.0
 """A worker that does not hand over a small result in this time is given up, as one that hangs."""
 
-
 _WORD_S = 1.0
 """For so long the nanny of a dead worker may take to say how it died."""
 
-
 Finished: TypeAlias = Generator[tuple[int, Payload], None, None]
-
 
 Tell: TypeAlias = Callable[[str], None]
 

@@ -21,7 +21,6 @@ AVAILABLE = sys.platform == "linux" and sys.version_info >= (3, 11, 1)
 The server of Python 3.11.0 listens where every user of the machine can send it code (CVE-2022-42919).
 """
 
-
 THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "OMP_NUM_THREADS",
@@ -31,7 +30,6 @@ THREAD_VARIABLES = (
     "BLOSC_NTHREADS",
     "ZARR_THREADING__MAX_WORKERS",
 )
-
 
 ENVIRONMENT = {
     **dict.fromkeys(THREAD_VARIABLES, "1"),
@@ -46,7 +44,6 @@ should not be forked.
 
 Dask's own limit for that, 64 KiB, makes the system clear the pages of every buffer anew: as much work as decoding.
 """
-
 
 _PRELOAD = ["tract_dask.run.worker_imports"]
 

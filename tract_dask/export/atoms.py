@@ -17,7 +17,6 @@ from .tables import ROWS, Floats, written_aside
 
 ALIGNMENTS = ("centre", "face")
 
-
 _PM_PER_ANGSTROM = 100.0
 
 

@@ -26,10 +26,8 @@ from ..store.schema import REJECTED
 
 Floats = NDArray[np.float64]
 
-
 ROWS = 1 << 17
 """Rows that are in memory at a time."""
-
 
 _MAT_LIMIT = (1 << 31) - 1
 
@@ -275,14 +273,12 @@ def _plain_attributes(tracks: xr.Dataset) -> dict[str, Any]:
 
 _PACKAGES = {".parquet": "pyarrow", ".nc": "h5netcdf"}
 
-
 _WRITERS: dict[str, Callable[[xr.Dataset, Path, bool], None]] = {
     ".csv": _write_csv,
     ".parquet": _write_parquet,
     ".nc": _write_netcdf,
     ".mat": _write_mat,
 }
-
 
 SUFFIXES = (*_WRITERS, ".xyz")
 """What a file may be called."""

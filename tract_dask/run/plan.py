@@ -18,10 +18,8 @@ from ..store.shards import split
 WORKER_BYTES = 300_000_000
 """What a worker process takes before it has read a pixel."""
 
-
 BATCH_BYTES = 128_000_000
 """What a task that reads the movie works on at a time, beside the frames themselves and the sums of the field."""
-
 
 _FILTER_BYTES = 40
 """A pixel of a frame that is filtered as a whole: its transform, powers and rings, or the dual of its gradient."""

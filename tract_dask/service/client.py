@@ -32,24 +32,18 @@ from .client_answers import check_answer, trusting, values_of
 
 API = "/api/v1"
 
-
 AT_REST = ENDED | {State.WAITING}
 """States in which a job stays until somebody does something."""
-
 
 FORMATS = {".zip": "zarr", ".nc": "nc", ".csv": "csv"}
 """What results can be downloaded as, by the suffix of the file."""
 
-
 _TIMEOUT_S, _CONNECT_S = 60.0, 10.0
-
 
 _SILENCE_S = 45.0
 """A stream of events that is silent for so long is dead: the service says something every 15 s."""
 
-
 _RETRY_S = (0.5, 10.0)
-
 
 _PAGE = 200
 

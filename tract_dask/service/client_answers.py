@@ -17,7 +17,6 @@ from ..settings.toml import to_dict
 
 _COME_BACK = (502, 503, 504)
 
-
 _KINDS = {name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, TractError)}
 """Classes of errors by name; what the service alone knows comes out as the nearest one."""
 

@@ -15,16 +15,12 @@ from ..errors import SettingsError, shown
 
 T = TypeVar("T")
 
-
 MOST_ITEMS = 1000
 """Items of a setting that is a list."""
 
-
 LINE = r"[^\n\r]+"
 
-
 WORD = r"[A-Za-z0-9_.:,@+-]+"
-
 
 WORD_FORM = "letters, digits and _ . : , @ + -"
 

@@ -22,7 +22,6 @@ from ..store.provenance import provenance
 Workers = Callable[[], Client]
 """Gives the client; connects at its first call (:class:`tract_dask.cluster.connect.LazyClient`)."""
 
-
 _ATTEMPTS = 3
 """So often a stage is gone through whose tasks left what is damaged then."""
 

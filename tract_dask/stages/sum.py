@@ -27,7 +27,6 @@ from .keep import Workers, kept
 
 Bools = NDArray[np.bool_]
 
-
 SUM_PARTS = 16
 """The sum is made in at most this many parts, whatever the number of workers."""
 

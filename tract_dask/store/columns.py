@@ -22,13 +22,10 @@ from .schema import Status
 
 _FIT_COLUMNS = tuple(name for name in parameters.PARAMETERS if name not in ("x", "y"))
 
-
 _FLAGS = {str(flag.name).lower(): int(flag) for flag in Status if flag}
-
 
 MOST_BYTES = 64 << 20
 """Bytes of a table of columns."""
-
 
 MOST_ROWS = 500_000
 """Lines of a table of columns."""

@@ -19,10 +19,8 @@ from .shard_files import crc32c
 ATTRIBUTE = "tract_dask"
 """Name of the attribute under which every store keeps its provenance and its own metadata."""
 
-
 FORMAT = 2
 """Number of the format in which stores are written. In format 1 chunks had no checksums, and stores no number."""
-
 
 _MARKS = ("frame_bad_pixels", "fit_ref", "quality", "exposure")
 """Arrays by which our stores are known where they do not say what they are."""

@@ -28,16 +28,12 @@ from .shards import Shard, split
 
 CODEC = "lz4"
 
-
 SHARDED = tuple(name for name in schema.RESULTS if name not in ("drift_measured", "time"))
 """The variables of which every shard of the movie makes one piece; the others are known from the start."""
 
-
 _TAIL_BYTES = 8 * (1 + len(SHARDED)) + CHECKSUM_BYTES
 
-
 _ABSENT = 2**64 - 1
-
 
 AGAIN = "Run the same command again: they are made anew"
 

@@ -21,10 +21,8 @@ from ..kernels.gaussian.parameters import PARAMETER_UNITS, PARAMETERS
 CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain")
 """What a movie's numbers mean: size of a pixel, time of a frame, dose of a frame, counts for one detector unit."""
 
-
 AXES = ("y", "x")
 """Labels of the ``axis`` dimension of a drift."""
-
 
 SIZES = {"parameter": len(PARAMETERS), "axis": len(AXES), "place": 16}
 """Dimensions of the results that have one length always; a ``place`` is one in vacuum."""
@@ -48,7 +46,6 @@ class Status(enum.IntFlag):
 
 REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | Status.OUTSIDE_FRAME | Status.BAD_FRAME
 """A fit with any of these flags is not accepted."""
-
 
 STATUS_ATTRIBUTES = {
     "flag_masks": [int(flag) for flag in Status if flag],
@@ -80,12 +77,9 @@ def _declare(*variables: Variable) -> dict[str, Variable]:
 
 _FIT = ("frame", "column_id", "parameter")
 
-
 _COLUMN = ("frame", "column_id")
 
-
 _NAN = float("nan")
-
 
 RESULTS = _declare(
     Variable("fit", _FIT, "float64", "mixed", "Estimates of Equation 1; x and y are drift-corrected", _NAN),
@@ -134,7 +128,6 @@ RESULTS = _declare(
 )
 """results.zarr: the tracks."""
 
-
 COLUMNS = _declare(
     Variable("x_ref", ("column_id",), "float64", "px", "Position in the summed image", _NAN),
     Variable("y_ref", ("column_id",), "float64", "px", "Position in the summed image", _NAN),
@@ -143,7 +136,6 @@ COLUMNS = _declare(
     Variable("status_ref", ("column_id",), "uint8", "1", "Flags of the fit on the summed image", 0),
 )
 """The columns as found in the summed image; also part of results.zarr."""
-
 
 DRIFT = _declare(
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
@@ -158,13 +150,11 @@ DRIFT = _declare(
 )
 """drift.zarr."""
 
-
 SUM = _declare(
     Variable("image", ("y", "x"), "float64", "counts", "Drift-corrected mean of the frames, counts a frame", _NAN),
     Variable("exposure", ("y", "x"), "uint32", "frames", "Frames that cover the pixel", 0),
 )
 """sum.zarr: the summed image, divided by the frames that cover each pixel."""
-
 
 STATISTICS = _declare(
     Variable("frame_min", ("t",), "float64", "detector units", "Smallest finite pixel of the frame", _NAN),

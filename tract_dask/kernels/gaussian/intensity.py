@@ -9,7 +9,6 @@ from .parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B
 
 Floats = NDArray[np.float64]
 
-
 INTENSITY_SCALE = {"paper": 0.9545**2, "ellipse": 1 - np.exp(-2)}
 """Share of a Gaussian inside two sigma: the paper's (a box of +-2 sigma) and that of the ellipse of Equation 5."""
 

@@ -21,9 +21,7 @@ from .settings_schema import settings_schema
 
 Shape = Annotated[list[int], Field(min_length=3, max_length=3, description="Frames, rows and columns.")]
 
-
 RelativePath = Annotated[Text, StringConstraints(max_length=1024)]
-
 
 SettingValues = Annotated[
     dict[str, dict[str, Any]],
@@ -31,9 +29,7 @@ SettingValues = Annotated[
     WithJsonSchema(settings_schema()),
 ]
 
-
 JobId = Annotated[str, Path(pattern="^[0-9a-f]{10}$", description="The job's id.", examples=["3f9a0c12de"])]
-
 
 After = Annotated[int, Query(ge=0, le=2**53, description="Only what came after the event of this number.")]
 

@@ -20,7 +20,6 @@ from .states import State
 MAX_ITEMS, MAX_DEPTH, MAX_TEXT = 20_000, 6, 4096
 """Values in the settings of a request, how deep they may be nested, and characters of one text."""
 
-
 _NOT_PLAIN = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
@@ -96,13 +95,10 @@ Text = Annotated[
     str, AfterValidator(plain_text), Field(json_schema_extra={"pattern": "^[^\\u0000-\\u001f\\u007f-\\u009f]*$"})
 ]
 
-
 Plain = BeforeValidator(plain_number)
 """Of a number in a body."""
 
-
 Label = Annotated[Text, StringConstraints(max_length=200)]
-
 
 EXAMPLE_JOB: dict[str, Any] = {
     "id": "3f9a0c12de",

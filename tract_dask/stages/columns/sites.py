@@ -15,9 +15,7 @@ from ...store.columns import column_dataset, is_inside, positions
 MOST_SITES = 1_000_000
 """Sites of all lattices together, those outside the image counted."""
 
-
 _MOST_COUNT = 1_000_000
-
 
 _LATTICE_KEYS = ("origin", "a", "a_count", "b", "b_count", "a_repeats", "b_repeats", "kind")
 

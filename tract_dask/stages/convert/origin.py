@@ -21,12 +21,9 @@ from .create import quantities
 
 DEFAULT_LAYOUT = ConvertSettings()
 
-
 STAGE = "convert"
 
-
 AS_THE_FILE_SAYS = MetadataSettings()
-
 
 DECLARED_NOTHING = SourceSettings()
 

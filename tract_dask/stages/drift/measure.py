@@ -41,26 +41,20 @@ from ...store.shards import Shard, Shards, split
 
 Bools = NDArray[np.bool_]
 
-
 LEVEL_PIXELS = 1 << 20
 """Drift is measured on the finest level with at most this many pixels a frame."""
-
 
 FOLD_LOSS = 0.03
 """It is binned by 2 and 2 again as long as that loses less than this share of the information on position."""
 
-
 SMALLEST_SIDE = 64
 """But not below this, px."""
-
 
 SEARCH_SHARE = 0.4
 """Search range as a share of the lattice period: two answers within it are never a period apart."""
 
-
 SEARCH_LOSS = 0.75
 """For the search it is binned by 2 and 2 again as long as that loses less than this share of the information."""
-
 
 PASSES: dict[str, Fields] = {
     "follow": {"drift": (None, 2), "placed": (None, 2), "trusted": (None,)},
@@ -68,18 +62,13 @@ PASSES: dict[str, Fields] = {
 }
 """The two runs over the movie, and what a shard's payload holds after each."""
 
-
 _BLOCK_BYTES = 16 << 20
-
 
 _SAMPLES, _SAMPLE_FRAMES = 4, 2
 
-
 _FEWEST_PARTS, _PART_FRAMES = 8, 64
 
-
 _TRUST = 0.5
-
 
 _MEMORY = 16
 

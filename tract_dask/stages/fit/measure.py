@@ -24,13 +24,10 @@ from .job import Job
 
 Values = dict[str, np.ndarray[Any, Any]]
 
-
 _BATCH_BYTES = 4 << 20
-
 
 _NOISE_SIDE_PX = 256
 """Blurred with sigma 2 px, a square of this side has noise for 1300 independent values: its size is known to 2 %."""
-
 
 _AT_BOUND = 1e-9
 """Share of the interval between its bounds within which a parameter is at its bound."""

@@ -29,7 +29,6 @@ from .measure import measure
 
 _COUNTS = ("fits", "accepted", "bad_frames")
 
-
 _ATTEMPTS = 3
 """So often shards are fitted whose fits turn out to be damaged on disk."""
 
