@@ -21,7 +21,7 @@ from tract_dask.cli import options
 from tract_dask.cli.terminal import Terminal
 from tract_dask.errors import ClusterError
 from tract_dask.progress import RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
-from tract_dask.run import pipeline
+from tract_dask.run import pipeline, session
 from tract_dask.run import plan as run_plan
 from tract_dask.settings import RunSettings, to_toml
 from tract_dask.store import run_folder
@@ -63,7 +63,7 @@ def inline(monkeypatch):
             def __init__(self, settings, given=None, on_connect=lambda client: None):
                 super().__init__(settings, client, on_connect)
 
-        monkeypatch.setattr(pipeline, "LazyClient", Here)
+        monkeypatch.setattr(session, "LazyClient", Here)
         yield client
 
 

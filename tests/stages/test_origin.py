@@ -16,7 +16,7 @@ from conftest import Scene
 from tract_dask.errors import ChangedSourceError, DestinationError, SourceError
 from tract_dask.progress import STAGES, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.readers import open_source
-from tract_dask.run import one_stage, pipeline
+from tract_dask.run import one_stage, pipeline, session
 from tract_dask.run.verify import repair, verify
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, RunSettings, SourceSettings
 from tract_dask.stages import keep
@@ -403,7 +403,7 @@ def run(source: Path | str, output: Path, settings: RunSettings, **more) -> tupl
     """Run in this process; return the stages that worked, and the warnings."""
     events = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "LazyClient", Nobody)
+        patch.setattr(session, "LazyClient", Nobody)
         pipeline.run(source, output, settings, on_event=events.append, report=False, **more)
     worked = {event.stage for event in events if isinstance(event, StageDone) and not event.reused}
     return worked, [event.message for event in events if isinstance(event, Warned)]

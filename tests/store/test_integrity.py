@@ -525,7 +525,7 @@ def test_a_store_that_was_being_removed_is_gone(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(datasets.shutil, "rmtree", killed)
+        patch.setattr(store_files.shutil, "rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             store_files.remove(store)
     assert store_metadata.attributes(store) == {}
@@ -538,7 +538,7 @@ def test_a_store_that_comes_between_two_looks_is_not_damaged(tmp_path, monkeypat
     datasets.write_dataset(
         xr.Dataset({"exposure": ("x", np.ones(3))}, attrs={store_metadata.ATTRIBUTE: {"key": "k"}}), aside
     )
-    look = datasets.read_json
+    look = store_metadata.read_json
 
     def read_json(file):
         found = look(file)
@@ -546,5 +546,5 @@ def test_a_store_that_comes_between_two_looks_is_not_damaged(tmp_path, monkeypat
             aside.rename(store)
         return found
 
-    monkeypatch.setattr(datasets, "read_json", read_json)
+    monkeypatch.setattr(store_metadata, "read_json", read_json)
     assert store_metadata.attributes(store)["key"] == "k"

@@ -516,7 +516,7 @@ def test_another_kind_of_store_is_not_replaced(tmp_path, source):
 
 
 def test_a_disk_that_is_too_small_is_told_before_work(tmp_path, source, monkeypatch):
-    monkeypatch.setattr(datasets.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
     with pytest.raises(DestinationError, match="disk is too small"):
         convert(source, tmp_path / "movie.zarr")
     assert [file.name for file in tmp_path.iterdir()] == ["movie.npy"]

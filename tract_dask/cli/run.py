@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..cluster.forkserver import uncollected
 from ..progress import STAGES
 from ..settings.run import RunSettings
 from .options import Command, setting_options
@@ -174,11 +173,11 @@ def _edit(table: Path, settings: RunSettings) -> bool:
 
 def get_ready(settings: RunSettings) -> None:
     """Import what runs; the server of the local workers, if there are to be any, imports at the same time."""
-    from ..cluster import forkserver
+    from ..cluster import forkserver  # which Windows has not
 
     if not (settings.cluster.scheduler or settings.cluster.scheduler_file):
         forkserver.start()
-    with uncollected():
+    with forkserver.uncollected():
         from ..run import one_stage  # noqa: F401
 
 

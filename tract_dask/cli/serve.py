@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 
-from ..cluster.forkserver import uncollected
 from ..settings.run import RunSettings
 from .options import setting_options
 from .show import PATH, Subgroup, common_options, debug_option, show
@@ -51,6 +50,8 @@ def serve(settings: RunSettings, **options: Any) -> None:
     Jobs and tokens are kept in the state folder, which lies outside of the data root. Stop it, or lose the machine:
     started again, it goes on with every job.
     """
+    from ..cluster.forkserver import uncollected  # which Windows has not
+
     with uncollected():
         from ..service import server
         from ..service.config import ServiceConfig
