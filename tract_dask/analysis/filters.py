@@ -97,7 +97,7 @@ def compare_filters(
         compared[f"{name}_difference"] = (compared[name] - plain[name]).assign_attrs(units="px")
     change = 100 * (compared["intensity"] / plain["intensity"] - 1)
     compared["intensity_difference"] = change.assign_attrs(units="%")
-    compared.attrs = {"pixel_size_pm": movie.pixel_size_pm, "window_px": job.window}
+    compared.attrs = {"pixel_size_pm": movie.pixel_size_pm, "window_px": job.window_px}
     return compared
 
 

@@ -18,7 +18,7 @@ from ..readers.listing import FileList
 from ..readers.source import FrameSource, Permit
 from ..settings.run import ColumnSettings, DriftSettings, FitSettings, RunSettings
 from ..stages.columns.sites import lattice_sites
-from ..stages.columns.window_size import check_window, default_window
+from ..stages.columns.window_size import resolve_window
 from ..stages.convert.origin import check_kept, is_movie_of, remembered_source
 from ..stages.drift.stage import read_drift_csv
 from ..stages.fit.job import check_counts
@@ -76,14 +76,13 @@ def check_columns(shape: tuple[int, ...], settings: ColumnSettings, window_px: i
         _check_place(settings.template, shape)
     for name in _LENGTHS:
         _check_length(name, getattr(settings, name), shape)
-    if window_px is not None:
-        check_window(window_px, shape)
-    elif settings.spacing_px is not None and settings.method != "auto":
-        check_window(default_window(settings.spacing_px), shape, f", from a spacing of {settings.spacing_px:.4g} px")
+    spacing_px = None if settings.method == "auto" else settings.spacing_px
+    if window_px is not None or spacing_px is not None:
+        resolve_window(window_px, shape, spacing_px)
 
 
 def check_fit(shape: tuple[int, ...], settings: FitSettings, drift: NDArray[np.float64] | None = None) -> None:
-    """Check the window and the vacuum box of fits in frames of ``shape`` (y, x).
+    """Check the vacuum box of fits in frames of ``shape`` (y, x).
 
     Parameters
     ----------
@@ -95,8 +94,6 @@ def check_fit(shape: tuple[int, ...], settings: FitSettings, drift: NDArray[np.f
     SettingsError
         As :func:`check_inputs`.
     """
-    if settings.window_px is not None:
-        check_window(settings.window_px, shape)
     if settings.vacuum_box is not None:
         check_box(settings.vacuum_box, shape, np.zeros((1, 2)) if drift is None else drift)
 

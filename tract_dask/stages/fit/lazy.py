@@ -80,8 +80,7 @@ def fit_columns(
     dataset = columns.assign_coords(schema.coordinates(movie.n_frames)).assign(_unpacked(packed, tails))
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", frame_times(movie), schema.RESULTS["time"].attributes)
-    blur = columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px)
-    dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window, blur)
+    dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window_px, job.reference_blur_px)
     return dataset
 
 

@@ -64,8 +64,8 @@ def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.nda
     job, unit = job.in_units, job.unit
     drift, gain = job.drift[start:stop], movie.gain / unit
     place = job.reference[None, :, [Y, X]] + drift[:, None]
-    corner = np.rint(place).astype(np.int64) - job.window // 2
-    outside = np.any((corner < 0) | (corner + job.window > np.array(movie.shape[1:])), axis=-1)
+    corner = np.rint(place).astype(np.int64) - job.window_px // 2
+    outside = np.any((corner < 0) | (corner + job.window_px > np.array(movie.shape[1:])), axis=-1)
     vacuum = _vacuum(job, drift, movie.shape[1:])
     bad = np.broadcast_to(job.bad[start:stop, None], outside.shape)
     if frame is None:
@@ -155,7 +155,7 @@ def _fit(
     of a sigma is active. A batch of frames is cut, blurred and fitted at a time, so small that its windows stay in the
     processor's cache. Standard errors are NaN after a filter of whole frames: there is no theory of its noise.
     """
-    settings, size = job.settings, job.window
+    settings, size = job.settings, job.window_px
     count = corner.shape[:2]
     first, lower, upper = _bounds(job, offset, size)
     batch = max(1, _BATCH_BYTES // (4 * size * size * count[1]))
@@ -253,7 +253,7 @@ def _bounds(job: Job, offset: Floats, size: int) -> tuple[Floats, Floats, Floats
 
 def _reach(job: Job) -> float:
     """Return how far a column may be from its place in the summed image, along x and along y, px."""
-    return min(job.settings.max_shift_px or job.window / 4, job.window / 2)
+    return min(job.settings.max_shift_px or job.window_px / 4, job.window_px / 2)
 
 
 def _vacuum(job: Job, drift: Floats, shape: tuple[int, ...]) -> NDArray[np.int64] | None:
@@ -276,7 +276,7 @@ def _read(
 ) -> Tiles:
     """Return the tiles of some frames that the windows (first row and column of each), or the vacuum, touch."""
     halo = gaussian_kernel(job.settings.noise_blur_px).size // 2
-    boxes = [np.concatenate([corner - halo, corner + job.window + halo], axis=-1)]
+    boxes = [np.concatenate([corner - halo, corner + job.window_px + halo], axis=-1)]
     if vacuum is not None:
         first, side = vacuum[:, :2], vacuum[:, 2:]
         boxes.append(np.concatenate([first - halo, first + side + halo], axis=-1))
@@ -295,10 +295,10 @@ def _empty_strengths(squares: NDArray[np.float32], start: int, job: Job) -> NDAr
     next, whichever shard the frame is in.
     """
     n_frames, n_places, side = len(squares), SIZES["place"], math.isqrt(SIZES["place"])
-    if squares.shape[-1] < job.window:
+    if squares.shape[-1] < job.window_px:
         return np.full((n_frames, n_places), np.nan, np.float32)
-    corners = np.rint(np.linspace(0, squares.shape[-1] - job.window, side)).astype(int)
-    windows = [squares[:, y : y + job.window, x : x + job.window] for y in corners for x in corners]
+    corners = np.rint(np.linspace(0, squares.shape[-1] - job.window_px, side)).astype(int)
+    windows = [squares[:, y : y + job.window_px, x : x + job.window_px] for y in corners for x in corners]
     which = (start + np.arange(n_frames)[:, None] + np.arange(n_places)) % len(job.reference)
-    found = strengths(np.stack(windows, axis=1).reshape(-1, job.window, job.window), job.filters, which.ravel())
+    found = strengths(np.stack(windows, axis=1).reshape(-1, job.window_px, job.window_px), job.filters, which.ravel())
     return found.reshape(n_frames, n_places)
