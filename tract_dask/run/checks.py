@@ -42,7 +42,7 @@ def check_inputs(shape: tuple[int, int, int], settings: RunSettings) -> None:
     """
     drift = check_drift(shape[0], settings.drift)
     check_columns(shape[1:], settings.columns, settings.fit.window_px)
-    check_fit(shape[1:], settings.fit, drift)
+    check_box(settings.fit.vacuum_box, shape[1:], drift)
     local_memory_limit(settings.cluster)
 
 
@@ -79,23 +79,6 @@ def check_columns(shape: tuple[int, ...], settings: ColumnSettings, window_px: i
     spacing_px = None if settings.method == "auto" else settings.spacing_px
     if window_px is not None or spacing_px is not None:
         resolve_window(window_px, shape, spacing_px)
-
-
-def check_fit(shape: tuple[int, ...], settings: FitSettings, drift: NDArray[np.float64] | None = None) -> None:
-    """Check the vacuum box of fits in frames of ``shape`` (y, x).
-
-    Parameters
-    ----------
-    drift
-        (frames, 2) in px; None where it is not known yet: then only a box that no drift brings inside is refused.
-
-    Raises
-    ------
-    SettingsError
-        As :func:`check_inputs`.
-    """
-    if settings.vacuum_box is not None:
-        check_box(settings.vacuum_box, shape, np.zeros((1, 2)) if drift is None else drift)
 
 
 def check_pixels_of(movie: Movie, settings: FitSettings) -> None:

@@ -30,37 +30,25 @@ from .vacuum import check_box, find_vacuum
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that the fit of a shard needs beside the pixels.
-
-    Attributes
-    ----------
-    columns
-        The columns in the summed image (:data:`schema.COLUMNS`).
-    drift
-        (frames, 2) measured drift, (y, x), px, of all frames of the movie.
-    bad
-        (frames,) frames with pixels that are NaN or infinite.
-    window_px
-        Side of the windows.
-    vacuum
-        (y0, y1, x0, x1) in the summed image, or None: noise is taken from the residuals.
-    reference_blur_px
-        Sigma of the blur that the summed image went through before its fit.
-    refined_by
-        Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured.
-    unit
-        Counts in the unit that frames are computed in.
-    """
+    """Everything that the fit of a shard needs beside the pixels."""
 
     columns: xr.Dataset
+    """The columns in the summed image (:data:`schema.COLUMNS`)."""
     drift: Floats
+    """(frames, 2) measured drift, (y, x), px, of all frames of the movie."""
     bad: NDArray[np.bool_]
+    """(frames,) frames with pixels that are NaN or infinite."""
     window_px: int
+    """Side of the windows."""
     vacuum: tuple[int, ...] | None
+    """(y0, y1, x0, x1) in the summed image, or None: noise is taken from the residuals."""
     reference_blur_px: float
+    """Sigma of the blur that the summed image went through before its fit."""
     refined_by: int | None
+    """Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured."""
     settings: FitSettings
     unit: float = 1.0
+    """Counts in the unit that the reference is in."""
 
     def save(self, path: Path, movie: Movie, key: str) -> None:
         """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
@@ -81,13 +69,7 @@ class Job:
     @classmethod
     @lru_cache(maxsize=4)
     def load(cls, path: Path, movie: Movie, key: str) -> Job:
-        """Return the job that :meth:`save` has written to ``path``.
-
-        Raises
-        ------
-        StoreError
-            Where what is there has another key.
-        """
+        """Return the job that :meth:`save` has written to ``path``; ``key`` tells one fit stage from the next."""
         columns = datasets.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
         about = metadata.attributes(path)
         if about.get("key") != key:
@@ -95,7 +77,7 @@ class Job:
         return cls(
             columns,
             columns["drift_measured"].to_numpy(),
-            bad_frames(movie.statistics()),
+            movie.statistics()["frame_bad_pixels"].to_numpy() > 0,
             window_px=about["window"],
             vacuum=tuple(about["vacuum"]) if about["vacuum"] else None,
             reference_blur_px=about["reference_blur_px"],
@@ -152,9 +134,8 @@ def prepare(
     spacing = None if given else neighbour_distance(positions(columns))
     window_px = resolve_window(given, movie.shape[1:], spacing)
     box = settings.vacuum_box
-    if box is not None:
-        check_box(box, movie.shape[1:], shift)
-    elif summed is not None:
+    check_box(box, movie.shape[1:], shift)
+    if box is None and summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
     check_pixels(statistics, str(movie.path))
@@ -164,19 +145,13 @@ def prepare(
     return Job(
         columns,
         shift,
-        bad_frames(statistics),
+        statistics["frame_bad_pixels"].to_numpy() > 0,
         window_px=window_px,
         vacuum=box,
         reference_blur_px=columns.attrs.get("blur_sigma_px", settings.blur_sigma_px),
         refined_by=settings.refine_columns if settings.refine_drift and measured else None,
         settings=settings,
     )
-
-
-def bad_frames(statistics: xr.Dataset) -> NDArray[np.bool_]:
-    """Return which frames have pixels that are NaN or infinite, (frames,)."""
-    bad: NDArray[np.bool_] = statistics["frame_bad_pixels"].to_numpy() > 0
-    return bad
 
 
 def check_counts(smallest: Floats) -> None:
