@@ -16,7 +16,7 @@ from ..errors import SettingsError
 from ..kernels.blur import cut_windows
 from ..kernels.gaussian.fit import fit_gaussians
 from ..kernels.gaussian.information import column_bounds
-from ..kernels.gaussian.intensity import intensities
+from ..kernels.gaussian.intensity import Floats, intensities
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ..settings.run import ColumnSettings, FitSettings
@@ -26,8 +26,6 @@ from ..store.columns import column_dataset, positions
 from ..store.files import write_aside
 from ..store.schema import REJECTED
 from .intensity import UNIT
-
-Floats = NDArray[np.float64]
 
 _PM_PER_ANGSTROM = 100.0
 _REACH = 1 / 8

@@ -21,13 +21,11 @@ from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv, write_columns_csv
 from ...store.schema import Status
 from .detect import METHODS, make_detector
-from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
+from .lattice import Lattice, Places, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .sites import lattice_columns, lattice_sites
 from .window_size import neighbour_distance, resolve_window
 
 __all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
-
-Places = NDArray[np.float64]
 
 _SAME = 1 / 3
 """Seeds nearer than this share of the spacing, after refinement, are one column."""
