@@ -201,7 +201,7 @@ def test_stages_take_sums_for_a_movie(scene, make_movie, tmp_path):
     away = drift["drift"].to_numpy() - truth
     assert np.abs(away - np.median(away, axis=0)).max() <= 0.25
     job = prepare(pairs, scene.columns(), drift, FitSettings())
-    fit_movie(pairs, scene.columns(), job, tmp_path / "results.zarr")
+    fit_movie(pairs, job, tmp_path / "results.zarr")
     lazily = fit_columns(pairs, scene.columns(), drift)
     np.testing.assert_array_equal(open_results(tmp_path / "results.zarr")["fit"], lazily["fit"])
     assert lazily.attrs.items() <= open_results(tmp_path / "results.zarr").attrs.items()

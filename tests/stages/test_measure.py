@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from tract_dask import accepted, convert, fit_columns, open_movie
-from tract_dask.errors import SettingsError
+from tract_dask.errors import SettingsError, StoreError
 from tract_dask.kernels.gaussian.intensity import intensities
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
+from tract_dask.stages.fit.job import Job, prepare
+from tract_dask.stages.fit.measure import FrameFits, measure
 from tract_dask.stages.fit.vacuum import find_vacuum
 from tract_dask.store.schema import Status
+from tract_dask.store.shards import Shard
 
 FREE = FitSettings(shape="free")
 
@@ -262,3 +265,52 @@ def test_a_field_without_vacuum_takes_its_noise_from_the_residuals(scene, make_m
 def test_settings_that_cannot_work_are_refused_before_the_fits(scene, make_movie, settings, message):
     with pytest.raises(SettingsError, match=message):
         fit_columns(make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), settings)
+
+
+def test_fits_move_and_change_their_unit_without_a_trace_in_the_ones_before():
+    windows = np.ones((2, 3))
+    fits = FrameFits(
+        **dict.fromkeys(("estimates", "stderr"), np.ones((2, 3, 7))),
+        **dict.fromkeys(("volume_stderr", "strength", "residual"), windows),
+        **dict.fromkeys(("converged", "at_bound", "held"), windows > 0),
+        r_squared=windows.astype("f4"),
+        n_iterations=windows.astype("i2"),
+        centroid=np.ones((2, 3, 2)),
+    )
+    outside = np.zeros((2, 3), bool)
+    outside[0, 1] = True
+    moved = fits.without(outside, np.array([False, True])).moved(np.array([10, 20])).scaled(4.0)
+    assert moved.estimates[0, 0].tolist() == [4, 21, 11, 1, 1, 1, 4]
+    assert moved.stderr[1, 2].tolist() == [4, 1, 1, 1, 1, 1, 4]
+    assert moved.volume_stderr[1, 0] == 4
+    assert np.isnan(moved.estimates[0, 1]).all()
+    np.testing.assert_array_equal(np.isnan(moved.centroid).all(axis=-1), [[False, True, False], [True, True, True]])
+    assert moved.centroid[0, 0].tolist() == [11, 21]
+    assert moved.n_iterations.tolist() == [[1, 0, 1], [1, 1, 1]]
+    assert all((values == 1).all() for values in vars(fits).values())
+
+
+@pytest.mark.parametrize("filter_", ["gaussian", "none", "wiener"])
+def test_a_single_frame_has_the_numbers_that_it_has_in_its_shard(scene, make_movie, filter_):
+    movie = make_movie(scene.counts())
+    columns, summed = scene.columns(), scene.summed()
+    job = prepare(movie, columns, scene.drift_dataset(), FitSettings(filter=filter_), summed=summed)
+    shard = measure(movie, movie.shards[0], job)
+    frame = measure(movie, Shard(0, 1, 2), job, whole=True)
+    for name, values in frame.items():
+        np.testing.assert_array_equal(values[0], shard[name][1], err_msg=name)
+
+
+@pytest.mark.parametrize("vacuum_box", [None, (2, 30, 2, 30)])
+def test_a_job_is_the_same_after_it_was_saved(scene, make_movie, tmp_path, vacuum_box):
+    movie = make_movie(scene.counts() * 1e-6)
+    settings = FitSettings(vacuum_box=vacuum_box, refine_columns=7)
+    job = prepare(movie, scene.columns(), scene.drift_dataset(), settings)
+    job.save(tmp_path / "results.zarr", movie, "key")
+    loaded = Job.load(tmp_path / "results.zarr", movie, "key")
+    for name in ("window_px", "vacuum", "reference_blur_px", "refined_by", "settings", "unit"):
+        assert getattr(loaded, name) == getattr(job, name), name
+    for name in ("reference", "drift", "bad"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(job, name), err_msg=name)
+    with pytest.raises(StoreError, match="other"):
+        Job.load(tmp_path / "results.zarr", movie, "other")

@@ -52,7 +52,7 @@ def movie(npy, tmp_path):
 def fit_into(movie, path):
     scene, events = Scene(n_frames=50), []
     job = fit_job.prepare(movie, scene.columns(), scene.drift_dataset(), FitSettings())
-    fit.fit_movie(movie, scene.columns(), job, path, on_event=events.append)
+    fit.fit_movie(movie, job, path, on_event=events.append)
     return metadata.attributes(path), [event.message for event in events if isinstance(event, Warned)]
 
 

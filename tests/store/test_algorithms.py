@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 from conftest import Scene
 
 from tract_dask.readers import open_source
@@ -21,7 +20,8 @@ from tract_dask.stages.fit import job as fit_job
 from tract_dask.stages.fit import stage as fit_stage
 from tract_dask.stages.fit.job import Job
 from tract_dask.stages.sum import sum_image
-from tract_dask.store import keys, schema
+from tract_dask.store import keys
+from tract_dask.store.columns import column_dataset
 from tract_dask.store.keys import KEYED, OTHERWISE, Keyed, counted
 from tract_dask.store.movie import Movie, open_movie
 from tract_dask.store.provenance import ALGORITHMS, stage_key
@@ -89,9 +89,10 @@ def test_the_key_of_a_fit_is_frozen():
         dose=None,
         gain=1.0,
     )
-    columns = xr.Dataset({"kind": ("column_id", schema.texts(["Ce", ""]))}, {"column_id": [1, 2]})
-    job = Job(np.ones((2, 7)), np.zeros((3, 2)), np.zeros(3, bool), 19, (0, 9, 0, 9), 10, FitSettings(threshold=2))
-    assert fit_stage.fit_key(movie, columns, job) == "1bf85792099b4b6760b828308988d32ec8369a75a56ef99bd254259a823f52a9"
+    columns = column_dataset(np.ones((2, 2)), ["Ce", ""], np.array([1, 2]), np.ones((2, 7)))
+    settings = FitSettings(threshold=2)
+    job = Job(columns, np.zeros((3, 2)), np.zeros(3, bool), 19, (0, 9, 0, 9), settings.blur_sigma_px, 10, settings)
+    assert fit_stage.fit_key(movie, job) == "1bf85792099b4b6760b828308988d32ec8369a75a56ef99bd254259a823f52a9"
 
 
 def test_numbers_and_bytes_count_by_value():
@@ -179,7 +180,7 @@ def results(tmp_path_factory) -> dict[str, list[float]]:
     drift, truth, image = estimate_drift(movie), scene.drift_dataset(), scene.summed()
     summed, columns = sum_image(movie, truth), find_columns(image)
     job = fit_job.prepare(movie, scene.columns(), truth, FitSettings(), summed=image)
-    fit_stage.fit_movie(movie, scene.columns(), job, folder / "results.zarr")
+    fit_stage.fit_movie(movie, job, folder / "results.zarr")
     tracks = open_results(folder / "results.zarr").load()
     level = movie.read_binned(4, 0, 2)
     return {

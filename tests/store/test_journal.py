@@ -90,7 +90,7 @@ def stage(request, scene, source, movie) -> Stage:
     def fitted(place, settings, on_event=lambda event: None):
         columns = scene.columns()
         job = prepare(movie, columns, scene.drift_dataset(), settings)
-        return fit_movie(movie, columns, job, place, on_event=on_event)
+        return fit_movie(movie, job, place, on_event=on_event)
 
     def tracks(place):
         return open_results(place).drop_attrs().load()
@@ -449,7 +449,7 @@ def test_a_key_file_that_makes_no_sense_begins_a_new_run(tmp_path, key):
 
 def fit(movie, scene, place, **more):
     columns = scene.columns()
-    return fit_movie(movie, columns, prepare(movie, columns, scene.drift_dataset(), FitSettings()), place, **more)
+    return fit_movie(movie, prepare(movie, columns, scene.drift_dataset(), FitSettings()), place, **more)
 
 
 def same(one: Path, other: Path) -> None:
@@ -599,10 +599,10 @@ def test_unfinished_results_that_are_damaged_keep_the_fits_that_are_done(movie, 
     columns, said = scene.columns(), []
     job = prepare(movie, columns, scene.drift_dataset(), FitSettings())
     with pytest.raises(Stopped):
-        fit_movie(movie, columns, job, tmp_path / "r.zarr", on_event=stop_after(3))
+        fit_movie(movie, job, tmp_path / "r.zarr", on_event=stop_after(3))
     harm(tmp_path / "r.zarr" / file, confuse if file.endswith("json") or confuse != CONFUSED[2] else zeros)
-    fit_movie(movie, columns, job, tmp_path / "r.zarr", on_event=said.append)
-    fit_movie(movie, columns, job, tmp_path / "whole.zarr")
+    fit_movie(movie, job, tmp_path / "r.zarr", on_event=said.append)
+    fit_movie(movie, job, tmp_path / "whole.zarr")
     assert len([event for event in said if isinstance(event, ShardDone)]) == len(movie.shards) - 3
     assert any("is damaged" in event.message for event in said if isinstance(event, Warned))
     found, whole = (open_results(tmp_path / f"{name}.zarr").drop_attrs().load() for name in ("r", "whole"))

@@ -28,7 +28,7 @@ def movie(scene, tmp_path, npy):
 def fit_all(movie, scene, path, settings=None, **more):
     columns = scene.columns()
     job = prepare(movie, columns, scene.drift_dataset(), settings or FitSettings())
-    return fit_movie(movie, columns, job, path, **more)
+    return fit_movie(movie, job, path, **more)
 
 
 class Killed(BaseException):

@@ -17,10 +17,11 @@ from ..settings.run import FitSettings
 from ..stages.fit.common_motion import CERTAIN
 from ..stages.fit.filters import filter_frame
 from ..stages.fit.job import prepare
-from ..stages.fit.measure import Values, measure_frame
+from ..stages.fit.measure import Values, measure
 from ..store import files
 from ..store.movie import Movie
 from ..store.schema import Status
+from ..store.shards import Shard
 
 FILTERS = ("none", "gaussian", "wiener", "tv-l1")
 """In the order of the paper's table; the first is what the others are compared with."""
@@ -88,7 +89,7 @@ def compare_filters(
     parts = []
     for name in FILTERS:
         job = prepare(movie, columns, drift, dataclasses.replace(settings, filter=name, refine_drift=False))
-        measured = [_frame_rows(measure_frame(movie, frame, job)) for frame in frames]
+        measured = [_frame_rows(measure(movie, Shard(0, frame, frame + 1), job, whole=True)) for frame in frames]
         parts.append(xr.concat(measured, "frame").assign_coords(column_id=known).sel(column_id=chosen))
     compared = xr.concat(parts, xr.IndexVariable("filter", list(FILTERS)))
     compared = compared.assign_coords(frame=list(frames)).transpose("frame", "filter", "column_id")
@@ -97,7 +98,7 @@ def compare_filters(
         compared[f"{name}_difference"] = (compared[name] - plain[name]).assign_attrs(units="px")
     change = 100 * (compared["intensity"] / plain["intensity"] - 1)
     compared["intensity_difference"] = change.assign_attrs(units="%")
-    compared.attrs = {"pixel_size_pm": movie.pixel_size_pm, "window_px": job.window}
+    compared.attrs = {"pixel_size_pm": movie.pixel_size_pm, "window_px": job.window_px}
     return compared
 
 

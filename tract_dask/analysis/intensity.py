@@ -155,7 +155,7 @@ def vacuum_level(
         coordinates = {"frame": np.arange(image.n_frames)}
     else:
         box = box or _found(image, columns, blur_sigma_px)
-        check_box(box, image["image"].shape, np.zeros((1, 2)), "vacuum_level: box")
+        check_box(box, image["image"].shape, None, "vacuum_level: box")
         y0, y1, x0, x1 = box
         pixels = image["image"].to_numpy()[y0:y1, x0:x1]
         level, stderr = _mean(pixels[None])[0]

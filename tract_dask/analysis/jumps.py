@@ -15,10 +15,9 @@ from scipy.special import gammainccinv, gammaincinv
 
 from ..errors import SettingsError
 from ..kernels.changepoints import gains, plateaus
+from ..kernels.gaussian.intensity import Floats
 from ..store import schema
 from .motion import named, positions, standard_errors
-
-Floats = NDArray[np.float64]
 
 _BLOCK_BYTES = 128 << 20
 """Columns are read in blocks of so many bytes: places and errors of all their frames."""

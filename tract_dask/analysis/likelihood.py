@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-Floats = NDArray[np.float64]
+from ..kernels.gaussian.intensity import Floats
 
 EMPTY_MEAN, EMPTY_SD = 1.65, 0.62
 """Intensity, in units of its standard error, that a fit finds where there is no column: it looks for the highest place.

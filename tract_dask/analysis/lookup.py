@@ -16,18 +16,16 @@ from ..errors import SettingsError
 from ..kernels.blur import cut_windows
 from ..kernels.gaussian.fit import fit_gaussians
 from ..kernels.gaussian.information import column_bounds
-from ..kernels.gaussian.intensity import intensities
+from ..kernels.gaussian.intensity import Floats, intensities
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ..settings.run import ColumnSettings, FitSettings
 from ..stages.columns.find import find_columns
-from ..stages.columns.window_size import default_window, neighbour_distance
+from ..stages.columns.window_size import neighbour_distance, resolve_window
 from ..store.columns import column_dataset, positions
 from ..store.files import write_aside
 from ..store.schema import REJECTED
 from .intensity import UNIT
-
-Floats = NDArray[np.float64]
 
 _PM_PER_ANGSTROM = 100.0
 _REACH = 1 / 8
@@ -103,14 +101,15 @@ def look_up_table(
             "images (image, y, x), and one Dataset of columns for all or for each",
             f"images {pages.shape}, {len(scenes)} Datasets",
         )
-    window = settings.window_px or default_window(_spacing(scenes))
-    fits = [_measured(page, scene, window, settings, contrast) for page, scene in zip(pages, scenes, strict=True)]
+    spacing = None if settings.window_px else neighbour_distance(positions(scenes[0]))
+    window_px = resolve_window(settings.window_px, pages.shape[1:], spacing)
+    fits = [_measured(page, scene, window_px, settings, contrast) for page, scene in zip(pages, scenes, strict=True)]
     atoms = np.concatenate([_atoms(scene, k + 1) for k, scene in enumerate(scenes)])
     site = np.concatenate([scene["column_id"].to_numpy() for scene in scenes]).astype(str)
-    table = _values(np.concatenate(fits), atoms, site, size, window, settings)
+    table = _values(np.concatenate(fits), atoms, site, size, window_px, settings)
     table.attrs = {
         "pixel_size_pm": size,
-        "window_pm": window * size,
+        "window_pm": window_px * size,
         "window_blur_pm": settings.window_blur_px * size,
         "estimator": settings.estimator,
         "intensity_scale": settings.intensity_scale,
@@ -228,35 +227,22 @@ def _pixel_size(images: Any, given: float | None) -> float:
     return float(size)
 
 
-def _spacing(scenes: Sequence[xr.Dataset]) -> float:
-    spacing = neighbour_distance(positions(scenes[0]))
-    if spacing is None:
-        raise SettingsError(
-            "one column alone does not tell how large its window should be",
-            "setting window_px (FitSettings)",
-            "two columns or more, or a window",
-            "one column",
-            "Give window_px",
-        )
-    return spacing
-
-
 def _atoms(scene: xr.Dataset, number: int) -> NDArray[np.int64]:
     if "atoms" in scene:
         return scene["atoms"].to_numpy().astype(np.int64)
     return np.full(scene.sizes["column_id"], number)
 
 
-def _measured(image: Floats, columns: xr.Dataset, window: int, settings: FitSettings, contrast: str) -> Floats:
+def _measured(image: Floats, columns: xr.Dataset, window_px: int, settings: FitSettings, contrast: str) -> Floats:
     """Return the fits of the columns of an image, (columns, 7); NaN where a fit is not accepted or left its column."""
     summed = xr.Dataset({"image": (("y", "x"), image), "exposure": (("y", "x"), np.ones(image.shape, np.uint32))})
-    reach = max(1.0, _REACH * window)
+    reach = max(1.0, _REACH * window_px)
     found = find_columns(
         summed,
         ColumnSettings(contrast=contrast, search_radius_px=reach, centroid_radius_px=reach),
         seeds=column_dataset(positions(columns), column_id=columns["column_id"]),
         blur_sigma_px=settings.blur_sigma_px if settings.estimator == "poisson" else settings.window_blur_px,
-        window_px=window,
+        window_px=window_px,
     )
     found = found[["fit_ref", "status_ref"]].reindex(
         column_id=columns["column_id"], fill_value={"status_ref": REJECTED}
@@ -266,30 +252,30 @@ def _measured(image: Floats, columns: xr.Dataset, window: int, settings: FitSett
     kept = ((found["status_ref"].to_numpy() & REJECTED) == 0) & (away < reach)
     fit[~kept] = np.nan
     if settings.estimator == "poisson":
-        fit[kept] = _likeliest(image, fit[kept], window, settings)
+        fit[kept] = _likeliest(image, fit[kept], window_px, settings)
     return fit
 
 
-def _likeliest(image: Floats, reference: Floats, window: int, settings: FitSettings) -> Floats:
+def _likeliest(image: Floats, reference: Floats, window_px: int, settings: FitSettings) -> Floats:
     """Return fits by maximum likelihood to the raw pixels, (n, 7), started from fits to the blurred ones."""
     start = blurred(reference, -(settings.blur_sigma_px**2))
-    corner = np.rint(start[:, [Y, X]]).astype(np.int64) - window // 2
+    corner = np.rint(start[:, [Y, X]]).astype(np.int64) - window_px // 2
     start[:, [Y, X]] -= corner
-    room = np.array([5 * np.abs(start[:, AMPLITUDE]), *np.full((2, len(start)), _REACH * window)])
+    room = np.array([5 * np.abs(start[:, AMPLITUDE]), *np.full((2, len(start)), _REACH * window_px)])
     lower, upper = start.copy(), start.copy()
     lower[:, [AMPLITUDE, X, Y]] -= room.T
     upper[:, [AMPLITUDE, X, Y]] += room.T
-    lower[:, [SIGMA_A, SIGMA_B]], upper[:, [SIGMA_A, SIGMA_B]] = 0.5, window
+    lower[:, [SIGMA_A, SIGMA_B]], upper[:, [SIGMA_A, SIGMA_B]] = 0.5, window_px
     lower[:, BACKGROUND], upper[:, BACKGROUND] = 0, image.max()
     fits = fit_gaussians(
-        cut_windows(image[None].astype(np.float32), corner[None, :, 0], corner[None, :, 1], window, 0.0)[0],
+        cut_windows(image[None].astype(np.float32), corner[None, :, 0], corner[None, :, 1], window_px, 0.0)[0],
         start,
         lower,
         upper,
         estimator="poisson",
         fixed_shape=settings.shape == "fixed",
         max_iterations=200,
-        radius_px=window / 2,
+        radius_px=window_px / 2,
     )
     estimates = np.where(fits.converged[:, None], fits.estimates, np.nan)
     estimates[:, [Y, X]] += corner
@@ -297,7 +283,7 @@ def _likeliest(image: Floats, reference: Floats, window: int, settings: FitSetti
 
 
 def _values(
-    fits: Floats, atoms: NDArray[np.int64], site: NDArray[np.str_], size: float, window: int, settings: FitSettings
+    fits: Floats, atoms: NDArray[np.int64], site: NDArray[np.str_], size: float, window_px: int, settings: FitSettings
 ) -> xr.Dataset:
     """Return the table of fits to images whose vacuum is 1."""
     area = (size / _PM_PER_ANGSTROM) ** 2
@@ -306,7 +292,7 @@ def _values(
     electrons = fits.copy()
     electrons[:, [AMPLITUDE, BACKGROUND]] *= area  # at 1 e/A^2
     sharp = blurred(electrons, -(settings.window_blur_px**2))
-    bound = intensity_bound(sharp, window, fixed_shape=settings.shape == "fixed")
+    bound = intensity_bound(sharp, window_px, fixed_shape=settings.shape == "fixed")
     for name, variance in (("variance_poisson", area * error**2), ("variance_fit", (bound * area * intensity) ** 2)):
         values = [np.nanmean(variance[atoms == n]) for n in table["atoms"].to_numpy()]
         table[name] = ("atoms", values, dict(zip(("units", "long_name"), TABLE[name], strict=True)))

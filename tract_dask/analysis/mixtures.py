@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from ..errors import SettingsError
-
-Floats = NDArray[np.float64]
+from ..kernels.gaussian.intensity import Floats
 
 _RANDOM_STARTS = 12
 _FIRST_STEPS = 30

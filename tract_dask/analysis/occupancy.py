@@ -307,8 +307,8 @@ def _reference(tracks: xr.Dataset, noise_scale: float) -> xr.Dataset:
     fits = tracks["fit_ref"].to_numpy().astype(np.float64)
     fits = np.where(np.isnan(fits), np.nanmedian(fits, axis=0), fits)
     sharp = blurred(fits, -(fitted_with(tracks, "reference_blur_px") ** 2))
-    window, held = fitted_with(tracks, "window_px"), fitted_with(tracks, "shape") == "fixed"
-    fixed, free = (intensity_bound(sharp, window, fixed_shape=fixed_shape) for fixed_shape in (True, False))
+    window_px, held = fitted_with(tracks, "window_px"), fitted_with(tracks, "shape") == "fixed"
+    fixed, free = (intensity_bound(sharp, window_px, fixed_shape=fixed_shape) for fixed_shape in (True, False))
     as_fitted = blurred(sharp, fitted_with(tracks, "window_blur_px") ** 2)
     intensity = np.abs(intensities(as_fitted, fitted_with(tracks, "intensity_scale"))[0])
     common = np.sqrt(np.maximum(free**2 - fixed**2, 0) / tracks.sizes["frame"])

@@ -188,12 +188,12 @@ def cramer_rao(tracks: xr.Dataset) -> xr.DataArray:
     pixels, and so, at the rim, those up to a blur beyond the window; and neighbours disturb the model. So a fit can
     come out some per cent below the bound, the more so where few are accepted.
     """
-    window = fitted_with(tracks, "window_px")
+    window_px = fitted_with(tracks, "window_px")
     column = _columns_as_they_are(tracks)
     places = column[:, [X, Y]]
-    column[:, [X, Y]] -= np.rint(places) - window // 2
+    column[:, [X, Y]] -= np.rint(places) - window_px // 2
     fixed = fitted_with(tracks, "shape") == "fixed"
-    bounds = column_bounds(column, window, radius_px=window / 2, fixed_shape=fixed)
+    bounds = column_bounds(column, window_px, radius_px=window_px / 2, fixed_shape=fixed)
     return _of_columns(tracks, np.sqrt((bounds.x + bounds.y) / 2) * pixel_size_pm(tracks), _COMPARED["crlb"])
 
 

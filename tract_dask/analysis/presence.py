@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ..errors import SettingsError
+from ..kernels.gaussian.intensity import Floats
 from ..kernels.presence import best_states
 from ..store import schema
 from .motion import named
-
-Floats = NDArray[np.float64]
 
 _FEWEST = 50
 """Strengths in vacuum without which theory has to do."""

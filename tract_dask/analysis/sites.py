@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..errors import SettingsError
+from ..kernels.gaussian.intensity import Floats
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _NEIGHBOURS = 12

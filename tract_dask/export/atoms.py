@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..analysis.motion import positions
 from ..errors import InputError, SettingsError
-from .tables import ROWS, Floats, written_aside
+from ..kernels.gaussian.intensity import Floats
+from .tables import ROWS, written_aside
 
 ALIGNMENTS = ("centre", "face")
 

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from ..errors import DestinationError, InputError, SettingsError
 from ..kernels.gaussian import parameters
+from ..kernels.gaussian.intensity import Floats
 from ..store import disk, files, metadata, results, schema
 from ..store.run_folder import RunFolder
 from ..store.schema import REJECTED
-
-Floats = NDArray[np.float64]
 
 ROWS = 1 << 17
 """Rows that are in memory at a time."""

@@ -21,10 +21,9 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingsError
+from ..kernels.gaussian.intensity import Floats
 from ..store import schema
 from ..store.columns import positions
-
-Floats = NDArray[np.float64]
 
 COLOURS = ("#56B4E9", "#E69F00", "#2CC295", "#CC79A7", "#F0E442", "#D55E00", "#FFFFFF")
 """One for each kind, on grey images: the colour-blind can tell them apart (after Okabe and Ito)."""

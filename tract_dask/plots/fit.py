@@ -16,6 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from ..errors import SettingsError
 from ..kernels.blur import blur, gaussian_kernel
+from ..kernels.gaussian.intensity import Floats
 from ..kernels.gaussian.model import evaluate
 from ..kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, THETA, X, Y
 from ..store.movie import Movie
@@ -24,7 +25,6 @@ from .base import (
     LINES,
     PAGE_INCHES,
     SIGNED_MAP,
-    Floats,
     colour_bar,
     graph,
     legend,

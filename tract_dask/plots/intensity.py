@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..analysis.intensity import repeated_error
+from ..kernels.gaussian.intensity import Floats
 from ..store.results import accepted
 from .base import (
     COLUMN_INCHES,
@@ -22,7 +23,6 @@ from .base import (
     PAGE_INCHES,
     SIZE_MAP,
     SMALL,
-    Floats,
     check_columns,
     colour_bar,
     course,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..analysis.motion import displacement, pixel_size_pm, spread, standard_errors
 from ..analysis.motion import positions as positions_pm
 from ..kernels.blur import blur, gaussian_kernel
+from ..kernels.gaussian.intensity import Floats
 from ..store.columns import positions
 from ..store.movie import Movie
 from .base import (
@@ -31,7 +32,6 @@ from .base import (
     SECOND,
     SIZE_MAP,
     SMALL,
-    Floats,
     check_columns,
     colour_bar,
     course,

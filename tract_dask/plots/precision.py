@@ -15,6 +15,7 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 from ..analysis.motion import pixel_size_pm
 from ..analysis.precision import column_precision
 from ..errors import SettingsError
+from ..kernels.gaussian.intensity import Floats
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import SIGMA_A, SIGMA_B, THETA
 from ..store.columns import positions
@@ -24,7 +25,6 @@ from .base import (
     LINE_MAP,
     LINES,
     SIZE_MAP,
-    Floats,
     colour_bar,
     graph,
     image_panels,

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ..analysis.presence import present
-from .base import LINES, PAGE_INCHES, Floats, colour_bar, graph, legend, new_figure, save, time_of
+from ..kernels.gaussian.intensity import Floats
+from .base import LINES, PAGE_INCHES, colour_bar, graph, legend, new_figure, save, time_of
 
 _THERE = LinearSegmentedColormap.from_list("there", ["#e6e6e6", LINES[0]])
 _MOST_COLUMNS = 1200

@@ -18,7 +18,7 @@ from ..readers.listing import FileList
 from ..readers.source import FrameSource, Permit
 from ..settings.run import ColumnSettings, DriftSettings, FitSettings, RunSettings
 from ..stages.columns.sites import lattice_sites
-from ..stages.columns.window_size import check_window, default_window
+from ..stages.columns.window_size import resolve_window
 from ..stages.convert.origin import check_kept, is_movie_of, remembered_source
 from ..stages.drift.stage import read_drift_csv
 from ..stages.fit.job import check_counts
@@ -42,7 +42,7 @@ def check_inputs(shape: tuple[int, int, int], settings: RunSettings) -> None:
     """
     drift = check_drift(shape[0], settings.drift)
     check_columns(shape[1:], settings.columns, settings.fit.window_px)
-    check_fit(shape[1:], settings.fit, drift)
+    check_box(settings.fit.vacuum_box, shape[1:], drift)
     local_memory_limit(settings.cluster)
 
 
@@ -76,29 +76,9 @@ def check_columns(shape: tuple[int, ...], settings: ColumnSettings, window_px: i
         _check_place(settings.template, shape)
     for name in _LENGTHS:
         _check_length(name, getattr(settings, name), shape)
-    if window_px is not None:
-        check_window(window_px, shape)
-    elif settings.spacing_px is not None and settings.method != "auto":
-        check_window(default_window(settings.spacing_px), shape, f", from a spacing of {settings.spacing_px:.4g} px")
-
-
-def check_fit(shape: tuple[int, ...], settings: FitSettings, drift: NDArray[np.float64] | None = None) -> None:
-    """Check the window and the vacuum box of fits in frames of ``shape`` (y, x).
-
-    Parameters
-    ----------
-    drift
-        (frames, 2) in px; None where it is not known yet: then only a box that no drift brings inside is refused.
-
-    Raises
-    ------
-    SettingsError
-        As :func:`check_inputs`.
-    """
-    if settings.window_px is not None:
-        check_window(settings.window_px, shape)
-    if settings.vacuum_box is not None:
-        check_box(settings.vacuum_box, shape, np.zeros((1, 2)) if drift is None else drift)
+    spacing_px = None if settings.method == "auto" else settings.spacing_px
+    if window_px is not None or spacing_px is not None:
+        resolve_window(window_px, shape, spacing_px)
 
 
 def check_pixels_of(movie: Movie, settings: FitSettings) -> None:

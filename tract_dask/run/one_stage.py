@@ -20,12 +20,13 @@ from ..stages.columns.stage import check_edited, columns_stage
 from ..stages.convert.stage import convert_stage
 from ..stages.drift.stage import drift_stage
 from ..stages.fit.stage import FitSummary, fit_stage
+from ..stages.fit.vacuum import check_box
 from ..stages.sum import sum_stage
 from ..store import datasets, files, metadata
 from ..store.movie import Movie, open_movie
 from ..store.run_folder import sum_beside
 from ..store.schema import drift_of
-from .checks import check_columns, check_drift, check_fit, check_pixels_of, check_suffix, open_input, with_whole_paths
+from .checks import check_columns, check_drift, check_pixels_of, check_suffix, open_input, with_whole_paths
 from .plan import plan_run
 from .session import Session, draw_columns
 
@@ -107,7 +108,7 @@ def run_fit(
     shift = None if drift is None else datasets.open_dataset(Path(drift))
     chosen = dataclasses.replace(settings.columns, method="csv", csv=str(table))
     check_columns(opened.shape[1:], chosen, settings.fit.window_px)
-    check_fit(opened.shape[1:], settings.fit, drift_of(shift, opened.n_frames))
+    check_box(settings.fit.vacuum_box, opened.shape[1:], drift_of(shift, opened.n_frames))
     check_pixels_of(opened, settings.fit)
     with Session(str(movie), path, settings.cluster, client, on_event) as session:
         attempt, workers, send = session.attempt, session.workers, session.send

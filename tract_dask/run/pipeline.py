@@ -34,12 +34,13 @@ from ..stages.convert.origin import is_movie_of
 from ..stages.convert.stage import convert_stage
 from ..stages.drift.stage import drift_stage
 from ..stages.fit.stage import FitSummary, fit_stage
+from ..stages.fit.vacuum import check_box
 from ..stages.sum import sum_stage
 from ..store import files, metadata
 from ..store.journal import journal_beside, remove_journal
 from ..store.movie import Movie
 from ..store.run_folder import RunFolder, sole_run
-from .checks import check_fit, check_inputs, check_output, check_pixels_of, check_stage, open_input, with_whole_paths
+from .checks import check_inputs, check_output, check_pixels_of, check_stage, open_input, with_whole_paths
 from .plan import Plan, expected_limit, plan_run
 from .session import Record, Session, draw_columns
 
@@ -211,7 +212,7 @@ def _stages(
     attempt(partial(check_pixels_of, movie, settings.fit))
     yield "convert"
     drift = attempt(partial(drift_stage, movie, outputs.drift, settings.drift, workers, send))
-    check_fit(movie.shape[1:], settings.fit, drift["drift"].to_numpy())
+    check_box(settings.fit.vacuum_box, movie.shape[1:], drift["drift"].to_numpy())
     yield "drift"
     summed = attempt(partial(sum_stage, movie, drift, outputs.sum, workers, send))
     yield "sum"

@@ -273,14 +273,14 @@ def _nothing_here(path: Path) -> MissingStoreError:
     )
 
 
-def how_fitted(settings: FitSettings, window: int, reference_blur_px: float) -> dict[str, Any]:
+def how_fitted(settings: FitSettings, window_px: int, reference_blur_px: float) -> dict[str, Any]:
     """Return what an analysis needs to know of the fits, as attributes of their Dataset.
 
     They are the window's diameter, sigma of the blur that the windows went through and of that of the summed image
     (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, and the ``intensity_scale``.
     """
     return {
-        "window_px": window,
+        "window_px": window_px,
         "window_blur_px": settings.window_blur_px,
         "reference_blur_px": float(reference_blur_px),
         "shape": settings.shape,

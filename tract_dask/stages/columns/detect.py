@@ -38,13 +38,8 @@ from ...store.journal import Payload
 from ...store.movie import Movie
 from ...store.provenance import stage_key
 from ...store.shards import Shard
-from .lattice import Relief, binned, find_lattice, pixel_noise, relief
+from .lattice import Mask, Places, Reals, Relief, binned, find_lattice, pixel_noise, relief
 from .window_size import default_window
-
-Floats = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
-Places = NDArray[np.float64]
-"""(n, 2) rows of (x, y), px."""
 
 METHODS = ("maxima", "blobs", "template")
 
@@ -88,14 +83,14 @@ class Detector:
     min_amplitude: float = 0.0
     sign: int = 1
     blur_sigma_px: float = 2.0
-    template: Floats | None = None
+    template: Reals | None = None
 
     @property
     def step(self) -> int:
         """Pixels in a bin: columns are looked for on 24 bins a spacing or more."""
         return max(1, int(self.spacing_px / _BINS_PER_SPACING))
 
-    def __call__(self, image: Floats, valid: Mask) -> tuple[Places, Floats]:
+    def __call__(self, image: Reals, valid: Mask) -> tuple[Places, Reals]:
         """Return the places of what it finds in an image (y, x), and the strengths, strongest first."""
         bright = self.sign * _filled(image, valid)
         noise = pixel_noise(bright, valid)
@@ -112,10 +107,10 @@ class Detector:
         radius = max(self.spacing_px / 8 / raised.step, 1.5)
         return raised.px(centroids(raised.height, peaks[inside][order], radius)), strength[order]
 
-    def _relief(self, image: Floats, valid: Mask, noise: float) -> Relief:
+    def _relief(self, image: Reals, valid: Mask, noise: float) -> Relief:
         return relief(image, valid, noise, self.spacing_px, self.blur_sigma_px)
 
-    def _blobs(self, image: Floats, valid: Mask, noise: float) -> Relief:
+    def _blobs(self, image: Reals, valid: Mask, noise: float) -> Relief:
         """White noise of standard deviation s has a Laplacian of Gaussian of s / (sqrt(2 pi) sigma^3)."""
         bins = binned(image, self.step).astype(np.float32)
         height = np.full(bins.shape, -np.inf, np.float32)
@@ -125,7 +120,7 @@ class Detector:
             np.maximum(height, -np.sqrt(2 * np.pi) * sigma**3 * response, out=height)
         return Relief(height, binned(valid, self.step) == 1, noise / self.step, self.step)
 
-    def _likeness(self, image: Floats, valid: Mask, noise: float) -> Relief:
+    def _likeness(self, image: Reals, valid: Mask, noise: float) -> Relief:
         from skimage.feature import match_template  # takes its time, and only this method needs it
 
         assert self.template is not None
@@ -134,7 +129,7 @@ class Detector:
         return Relief(height.astype(np.float32), binned(valid, self.step) == 1, 1.0, self.step)
 
 
-def make_detector(image: Floats, valid: Mask, settings: ColumnSettings, *, blur_sigma_px: float = 2.0) -> Detector:
+def make_detector(image: Reals, valid: Mask, settings: ColumnSettings, *, blur_sigma_px: float = 2.0) -> Detector:
     """Return the detector of the settings; what they leave open, the spacing and the template, is taken from an image.
 
     Raises
@@ -167,7 +162,7 @@ def make_detector(image: Floats, valid: Mask, settings: ColumnSettings, *, blur_
     return replace(maxima, method=settings.method, template=template)
 
 
-def _template(image: Floats, valid: Mask, maxima: Detector, at: tuple[int, ...] | None) -> Floats:
+def _template(image: Reals, valid: Mask, maxima: Detector, at: tuple[int, ...] | None) -> Reals:
     """Return a column's picture on bins: that at the place ``at`` (x, y), or the mean of the strongest ones."""
     bins = maxima.sign * binned(_filled(image, valid), maxima.step)
     exposed = binned(valid, maxima.step) == 1
@@ -266,14 +261,14 @@ def detect_columns(
     )
 
 
-def _filled(image: Floats, valid: Mask) -> Floats:
+def _filled(image: Reals, valid: Mask) -> Reals:
     """Return the image in units of :func:`unit_of`, with the median of its valid pixels where it is not valid."""
     unit = unit_of(image)
     image = image if unit == 1 else image / unit
     return image if valid.all() else np.where(valid, image, np.median(image[valid]))
 
 
-def _image(source: ArrayLike) -> Floats:
+def _image(source: ArrayLike) -> Reals:
     image = np.asarray(source)
     if image.ndim != 2 or image.dtype.kind not in "iuf":
         raise InputError(
@@ -285,12 +280,12 @@ def _image(source: ArrayLike) -> Floats:
     return image.astype(np.float64)
 
 
-def _masked(image: Floats) -> tuple[Floats, Mask]:
+def _masked(image: Reals) -> tuple[Reals, Mask]:
     """Return an image, and where its pixels are numbers."""
     return image, np.isfinite(image)
 
 
-def _rows(detector: Detector, image: Floats, valid: Mask, frame: int) -> Places:
+def _rows(detector: Detector, image: Reals, valid: Mask, frame: int) -> Places:
     """Return what is found in an image as (n, 4) rows of frame, y, x, strength; none in an image without pixels."""
     if not valid.any():
         return np.empty((0, len(_FIELDS)))

@@ -21,13 +21,11 @@ from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv, write_columns_csv
 from ...store.schema import Status
 from .detect import METHODS, make_detector
-from .lattice import Lattice, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
+from .lattice import Lattice, Places, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .sites import lattice_columns, lattice_sites
-from .window_size import check_window, default_window, neighbour_distance
+from .window_size import neighbour_distance, resolve_window
 
 __all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
-
-Places = NDArray[np.float64]
 
 _SAME = 1 / 3
 """Seeds nearer than this share of the spacing, after refinement, are one column."""
@@ -125,14 +123,13 @@ def find_columns(
     schema.validate(summed, schema.SUM, "summed image")
     scene = _scene(summed, settings, blur_sigma_px)
     found, spacing = _seeds(scene, settings, seeds)
-    reason = "" if window_px else f", from a spacing of {spacing:.4g} px"
-    window = check_window(window_px or default_window(spacing), scene.image.shape, reason)
+    window_px = resolve_window(window_px, scene.image.shape, spacing)
     search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
     centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
     places = _refined(scene.relief(spacing, min(search / 6, centroid / 3)), found.places, search, centroid)
-    inside, corner = _corners(places, window, scene.valid)
+    inside, corner = _corners(places, window_px, scene.valid)
     places = np.where(inside[:, None], places, found.places)
-    fit, status = _fit(scene, places, corner, inside, found.kind, window, max(search, 1.0))
+    fit, status = _fit(scene, places, corner, inside, found.kind, window_px, max(search, 1.0))
     fit[:, [AMPLITUDE, BACKGROUND]] *= scene.unit
     if seeds is not None and "share" in seeds:
         fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
@@ -146,7 +143,7 @@ def find_columns(
     name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
     columns.attrs = {
         "spacing_px": neighbour_distance(places[kept]) or spacing,
-        "window_px": window,
+        "window_px": window_px,
         "contrast": settings.contrast,
         "blur_sigma_px": float(blur_sigma_px),
         "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
@@ -258,13 +255,13 @@ def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float
     return seeds, settings.spacing_px or neighbour_distance(distinct) or finest
 
 
-def _corners(places: Places, window: int, valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _corners(places: Places, window_px: int, valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Return whether each window is wholly on exposed pixels, and its first pixel (x, y)."""
-    corner = np.rint(places).astype(np.int64) - window // 2
-    inside = np.all((corner >= 0) & (corner + window <= np.array(valid.shape[::-1])), axis=1)
+    corner = np.rint(places).astype(np.int64) - window_px // 2
+    inside = np.all((corner >= 0) & (corner + window_px <= np.array(valid.shape[::-1])), axis=1)
     for column in np.flatnonzero(inside):
         x, y = corner[column]
-        inside[column] = valid[y : y + window, x : x + window].all()
+        inside[column] = valid[y : y + window_px, x : x + window_px].all()
     return inside, corner
 
 
@@ -274,7 +271,7 @@ def _fit(
     corner: NDArray[np.int64],
     inside: NDArray[np.bool_],
     kind: NDArray[np.str_],
-    window: int,
+    window_px: int,
     search: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return (n, 7) fits, NaN where the window leaves the image, and (n,) flags.
@@ -287,9 +284,9 @@ def _fit(
     if not inside.any():
         return fit, status
     x, y = corner[inside].T
-    windows = cut_windows(scene.counts[None], y[None], x[None], window, scene.blur_sigma_px)[0]
+    windows = cut_windows(scene.counts[None], y[None], x[None], window_px, scene.blur_sigma_px)[0]
     start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
-    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200, "radius_px": window / 2}
+    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200, "radius_px": window_px / 2}
     fits = fit_gaussians(windows, start, lower, upper, **options)
     odd = _odd_shapes(fits, kind[inside], start, lower, upper)
     if odd.any():

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ...kernels.blur import blur
 from ...kernels.peaks import box_means, local_maxima
 
-Floats = NDArray[np.floating[Any]]
+Reals = NDArray[np.floating[Any]]
 Places = NDArray[np.float64]
 """(n, 2) rows of (x, y), px."""
 Mask = NDArray[np.bool_]
@@ -88,7 +88,7 @@ class Relief:
         Standard deviation of ``height`` where there is nothing.
     """
 
-    height: Floats
+    height: Reals
     valid: Mask
     noise: float
     step: int
@@ -103,7 +103,7 @@ class Relief:
 
 
 def find_lattice(
-    image: Floats, valid: Mask, noise: float, blur_sigma_px: float, spacing_px: float | None = None
+    image: Reals, valid: Mask, noise: float, blur_sigma_px: float, spacing_px: float | None = None
 ) -> Lattice | None:
     """Return the lattice of an image from its autocorrelation, or None where it has none.
 
@@ -146,20 +146,20 @@ def find_lattice(
     return Lattice((float(a[0]), float(a[1])), (float(b[0]), float(b[1])))
 
 
-def _shortest(shifts: Places, heights: Floats, least: float) -> Places | None:
+def _shortest(shifts: Places, heights: Reals, least: float) -> Places | None:
     """Return the shortest shift (x, y) that is nearly as high as the highest; None where none is high enough."""
     high = np.flatnonzero(heights >= max(least, _SAME_LATTICE * heights.max(initial=0.0)))
     return shifts[min(high, key=lambda n: float(shifts[n] @ shifts[n]))] if len(high) else None
 
 
-def binned(image: Floats | Mask, step: int) -> Places:
+def binned(image: Reals | Mask, step: int) -> Places:
     """Return the means of blocks of ``step`` pixels, without the rest at the right and the bottom."""
     ny, nx = (size // step for size in image.shape)
     rows = image[: ny * step, : nx * step].reshape(ny, step, nx * step).mean(axis=1, dtype=np.float64)
     return np.asarray(rows.reshape(ny, nx, step).mean(axis=2))
 
 
-def expanded(bins: Floats, shape: tuple[int, int], step: int, first: tuple[float, float]) -> Floats:
+def expanded(bins: Reals, shape: tuple[int, int], step: int, first: tuple[float, float]) -> Reals:
     """Return ``bins`` on pixels, interpolated linearly; a product with two matrices of weights.
 
     Parameters
@@ -179,12 +179,12 @@ def expanded(bins: Floats, shape: tuple[int, int], step: int, first: tuple[float
     return np.asarray(down.astype(np.float32) @ bins @ across.T.astype(np.float32))
 
 
-def sample(values: Floats) -> Floats:
+def sample(values: Reals) -> Reals:
     """Return about a million of the values, evenly spaced, where there are more."""
     return values[:: max(1, len(values) // _SAMPLE)]
 
 
-def _autocorrelation(image: Floats, valid: Mask, noise: float) -> tuple[Floats, Places]:
+def _autocorrelation(image: Reals, valid: Mask, noise: float) -> tuple[Reals, Places]:
     """Return the heights and shifts (x, y) of the maxima of an image's autocorrelation, one of each opposite pair.
 
     The image is freed of its slow background and of outliers. Its autocorrelation is divided by that of its envelope
@@ -217,7 +217,7 @@ def _autocorrelation(image: Floats, valid: Mask, noise: float) -> tuple[Floats, 
     return heights[half], shifts[half]
 
 
-def _correlate(image: Floats) -> Floats:
+def _correlate(image: Reals) -> Reals:
     """Return the autocorrelation of an image for shifts of up to half of it.
 
     Only one of each opposite pair of shifts is there: down by -3 px (``_MARGIN``) and more, along x the middle is zero.
@@ -230,14 +230,14 @@ def _correlate(image: Floats) -> Floats:
     return np.ascontiguousarray(whole[rows][:, columns])
 
 
-def _vertex(values: Floats, y: NDArray[np.int64], x: NDArray[np.int64], dy: int, dx: int) -> Floats:
+def _vertex(values: Reals, y: NDArray[np.int64], x: NDArray[np.int64], dy: int, dx: int) -> Reals:
     """Return how far from the maxima (y, x) the parabola through them and their two neighbours has its vertex."""
     before, at, after = values[y - dy, x - dx], values[y, x], values[y + dy, x + dx]
     bend = before - 2 * at + after
     return np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
 
 
-def smooth(image: Floats, sigma: float) -> Floats:
+def smooth(image: Reals, sigma: float) -> Reals:
     """Return ``image`` smoothed by about a Gaussian of ``sigma`` px, three passes of a box; a wide one on bins."""
     step = _coarseness(sigma)
     radius = round((np.sqrt(4 * (sigma / step) ** 2 + 1) - 1) / 2)
@@ -252,7 +252,7 @@ def _coarseness(sigma: float) -> int:
     return max(1, int(sigma / _COARSE))
 
 
-def pixel_noise(image: Floats, valid: Mask) -> float:
+def pixel_noise(image: Reals, valid: Mask) -> float:
     """Return the standard deviation of the white noise of an image, from its second differences (Immerkær 1996).
 
     Of a large image some rows are taken.
@@ -270,7 +270,7 @@ def damping(sigma: float) -> float:
 
 
 def relief(
-    image: Floats, valid: Mask, noise: float, spacing: float, blur_sigma_px: float, precision_px: float = np.inf
+    image: Reals, valid: Mask, noise: float, spacing: float, blur_sigma_px: float, precision_px: float = np.inf
 ) -> Relief:
     """Return the image in which columns ``spacing`` px apart stand out.
 
@@ -339,7 +339,7 @@ def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_ampl
     return np.asarray(peaks[_spread(peaks, taken, weights >= strong, 1.1 * lattice.hole)])
 
 
-def _start(peaks: Places, weights: Floats, lattice: Lattice) -> tuple[int, float]:
+def _start(peaks: Places, weights: Reals, lattice: Lattice) -> tuple[int, float]:
     """Return the peak of step 2 of :func:`find_peaks` (of few columns, one of the highest pair), and its measure."""
     sites = peaks[:, None] + lattice.translations(1)
     distance, neighbour = cKDTree(peaks).query(sites, distance_upper_bound=TOLERANCE * lattice.spacing)
@@ -350,7 +350,7 @@ def _start(peaks: Places, weights: Floats, lattice: Lattice) -> tuple[int, float
     return start, float(support[start])
 
 
-def _grow(peaks: Places, weights: Floats, lattice: Lattice, start: int, weakest: float, strong: float) -> Mask:
+def _grow(peaks: Places, weights: Reals, lattice: Lattice, start: int, weakest: float, strong: float) -> Mask:
     """Return which of the peaks, strongest first, belong to the sublattice of one: step 3 of :func:`find_peaks`."""
     tree = cKDTree(peaks)
     taken = np.zeros(len(peaks), dtype=bool)

@@ -33,20 +33,32 @@ def default_window(spacing_px: float) -> int:
     return max(7, 2 * round(0.25 * spacing_px) + 1)
 
 
-def check_window(window_px: int, shape: tuple[int, ...], reason: str = "") -> int:
-    """Return ``window_px`` if it is odd and fits into a frame of ``shape`` (y, x).
+def resolve_window(window_px: int | None, shape: tuple[int, ...], spacing_px: float | None = None) -> int:
+    """Return the diameter of the windows in frames of ``shape`` (y, x): ``window_px``, or what suits ``spacing_px``.
 
     Raises
     ------
     SettingsError
-        Where it does not; ``reason`` says where it came from.
+        Where it is even, too small or larger than the frame; or where neither is given.
     """
-    if window_px % 2 == 0 or not SMALLEST_PX <= window_px <= min(shape):
+    if window_px:
+        resolved, reason = window_px, ""
+    elif spacing_px is not None:
+        resolved, reason = default_window(spacing_px), f", from a spacing of {spacing_px:.4g} px"
+    else:
+        raise SettingsError(
+            "one column alone does not tell how large its window should be",
+            "setting window_px (FitSettings)",
+            "two columns or more, or a window",
+            "one column",
+            "Give window_px",
+        )
+    if resolved % 2 == 0 or not SMALLEST_PX <= resolved <= min(shape):
         raise SettingsError(
             "the window cannot be used",
             "setting window_px (FitSettings)",
             f"an odd number from {SMALLEST_PX} to {min(shape)}, the shorter side of a frame",
-            f"{window_px}{reason}",
+            f"{resolved}{reason}",
             "Give another window_px, or spacing_px if that spacing is wrong",
         )
-    return window_px
+    return resolved

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.gaussian.fit import GaussianFits
 from ...kernels.gaussian.intensity import Floats
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...store.schema import REJECTED
@@ -15,7 +14,7 @@ CERTAIN = 13.8
 """Chi-squared of two degrees of freedom at 99.9 %."""
 
 
-def common_motion(fits: GaussianFits, status: NDArray[np.uint8], drift: Floats, job: Job) -> Floats:
+def common_motion(estimates: Floats, status: NDArray[np.uint8], drift: Floats, job: Job) -> Floats:
     """Return how far the accepted columns of each frame moved together, (frames, 2): what the drift had missed.
 
     Zero unless it stands out of its own error with 99.9 % certainty (chi-squared of both axes above 13.8):
@@ -25,7 +24,7 @@ def common_motion(fits: GaussianFits, status: NDArray[np.uint8], drift: Floats, 
     motion = np.zeros_like(drift)
     if job.refined_by is None:
         return motion
-    away = fits.estimates[..., [Y, X]] - drift[:, None] - job.reference[:, [Y, X]]
+    away = estimates[..., [Y, X]] - drift[:, None] - job.reference[:, [Y, X]]
     expected = np.sqrt(np.abs(job.reference[:, BACKGROUND]) + np.abs(job.reference[:, AMPLITUDE]) / 2)
     expected /= np.abs(job.reference[:, AMPLITUDE]) + 1e-12
     good = (status & REJECTED) == 0

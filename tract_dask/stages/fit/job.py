@@ -18,60 +18,105 @@ from ...kernels.magnitude import unit_of
 from ...kernels.presence import Filters, matched_filters
 from ...settings.run import FitSettings
 from ...settings.toml import from_toml
-from ...store import datasets, metadata, schema
+from ...store import datasets, metadata, results, schema
+from ...store.columns import positions
 from ...store.journal import left_over
 from ...store.movie import Movie
-from ..columns.window_size import check_window, default_window, neighbour_distance
+from ...store.provenance import provenance
+from ..columns.window_size import neighbour_distance, resolve_window
 from ..pixel_range import check_pixels
 from .vacuum import check_box, find_vacuum
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that the fit of a shard needs beside the pixels.
+    """Everything that the fit of a shard needs beside the pixels."""
 
-    Attributes
-    ----------
-    reference
-        (columns, 7) fit on the summed image; what could not be fitted there holds the median shape at the seed's place.
-    drift
-        (frames, 2) measured drift, (y, x), px, of all frames of the movie.
-    bad
-        (frames,) frames with pixels that are NaN or infinite.
-    window
-        Side of the windows in px.
-    vacuum
-        (y0, y1, x0, x1) in the summed image, or None: noise is taken from the residuals.
-    refined_by
-        Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured.
-    """
-
-    reference: Floats
+    columns: xr.Dataset
+    """The columns in the summed image (:data:`schema.COLUMNS`)."""
     drift: Floats
+    """(frames, 2) measured drift, (y, x), px, of all frames of the movie."""
     bad: NDArray[np.bool_]
-    window: int
+    """(frames,) frames with pixels that are NaN or infinite."""
+    window_px: int
+    """Side of the windows."""
     vacuum: tuple[int, ...] | None
+    """(y0, y1, x0, x1) in the summed image, or None: noise is taken from the residuals."""
+    reference_blur_px: float
+    """Sigma of the blur that the summed image went through before its fit."""
     refined_by: int | None
+    """Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured."""
     settings: FitSettings
+    unit: float = 1.0
+    """Counts in the unit that the reference is in."""
+
+    def save(self, path: Path, movie: Movie, key: str) -> None:
+        """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
+        results.create(
+            path,
+            self.columns,
+            self.drift,
+            frame_times(movie),
+            movie.shards[0].frames,
+            **provenance(key, self.settings, str(movie.path)),
+            **calibration(movie),
+            window=self.window_px,
+            vacuum=self.vacuum,
+            reference_blur_px=self.reference_blur_px,
+            refine_columns=self.refined_by,
+        )
+
+    @classmethod
+    @lru_cache(maxsize=4)
+    def load(cls, path: Path, movie: Movie, key: str) -> Job:
+        """Return the job that :meth:`save` has written to ``path``; ``key`` tells one fit stage from the next."""
+        columns = datasets.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
+        about = metadata.attributes(path)
+        if about.get("key") != key:
+            raise left_over(path, f"key {key}", f"key {about.get('key')}")
+        return cls(
+            columns,
+            columns["drift_measured"].to_numpy(),
+            movie.statistics()["frame_bad_pixels"].to_numpy() > 0,
+            window_px=about["window"],
+            vacuum=tuple(about["vacuum"]) if about["vacuum"] else None,
+            reference_blur_px=about["reference_blur_px"],
+            refined_by=about["refine_columns"],
+            settings=from_toml(FitSettings, about["settings"], str(path)),
+        )
+
+    @cached_property
+    def reference(self) -> Floats:
+        """(columns, 7) fit on the summed image, as it would be after the blur of the windows, in :attr:`unit`.
+
+        What could not be fitted there holds the median shape at the seed's place.
+        """
+        reference: Floats = self.columns["fit_ref"].to_numpy().astype(np.float64)
+        known = np.isfinite(reference).all(axis=1)
+        if not known.any():
+            raise SettingsError(
+                "no column could be fitted in the summed image",
+                "columns",
+                "at least one",
+                "0",
+                "Check the contrast and the seeds",
+            )
+        reference[~known] = np.median(reference[known], axis=0)
+        reference[:, X] = np.where(known, reference[:, X], self.columns["x_ref"].to_numpy())
+        reference[:, Y] = np.where(known, reference[:, Y], self.columns["y_ref"].to_numpy())
+        reference = blurred(reference, self.settings.window_blur_px**2 - self.reference_blur_px**2)
+        reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
+        return reference
 
     @cached_property
     def filters(self) -> Filters:
         """The matched filter of each column, by which it is told whether it is there."""
-        return matched_filters(self.reference, self.window, self.settings.window_blur_px)
-
-    @cached_property
-    def unit(self) -> float:
-        """Counts in the unit that frames are computed in."""
-        return unit_of(self.reference[:, [AMPLITUDE, BACKGROUND]])
+        return matched_filters(self.reference, self.window_px, self.settings.window_blur_px)
 
     @cached_property
     def in_units(self) -> Job:
-        """The same with the reference's counts in that unit."""
-        if self.unit == 1:
-            return self
-        reference = self.reference.copy()
-        reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
-        return replace(self, reference=reference)
+        """The same with the reference's counts in the unit that frames are computed in."""
+        return replace(self, unit=unit_of(self.reference[:, [AMPLITUDE, BACKGROUND]]))
 
 
 def prepare(
@@ -85,22 +130,28 @@ def prepare(
     """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
     schema.validate(columns, schema.COLUMNS, "columns")
     shift = schema.drift_of(drift, movie.n_frames)
-    window = settings.window_px or int(columns.attrs.get("window_px") or default_window(_spacing(columns)))
-    check_window(window, movie.shape[1:])
+    given = settings.window_px or columns.attrs.get("window_px")
+    spacing = None if given else neighbour_distance(positions(columns))
+    window_px = resolve_window(given, movie.shape[1:], spacing)
     box = settings.vacuum_box
-    if box is not None:
-        check_box(box, movie.shape[1:], shift)
-    elif summed is not None:
+    check_box(box, movie.shape[1:], shift)
+    if box is None and summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
     check_pixels(statistics, str(movie.path))
-    bad = statistics["frame_bad_pixels"].to_numpy() > 0
     if settings.estimator == "poisson":
         check_counts(statistics["frame_min"].to_numpy())
-    blur = columns.attrs.get("blur_sigma_px", settings.blur_sigma_px)
     measured = drift is not None and drift.attrs.get("method") != "none"
-    refined_by = settings.refine_columns if settings.refine_drift and measured else None
-    return Job(_reference(columns, blur, settings), shift, bad, window, box, refined_by, settings)
+    return Job(
+        columns,
+        shift,
+        statistics["frame_bad_pixels"].to_numpy() > 0,
+        window_px=window_px,
+        vacuum=box,
+        reference_blur_px=columns.attrs.get("blur_sigma_px", settings.blur_sigma_px),
+        refined_by=settings.refine_columns if settings.refine_drift and measured else None,
+        settings=settings,
+    )
 
 
 def check_counts(smallest: Floats) -> None:
@@ -122,60 +173,9 @@ def check_counts(smallest: Floats) -> None:
         )
 
 
-def _spacing(columns: xr.Dataset) -> float:
-    """Return the median distance from a column to its nearest neighbour, px."""
-    place = np.stack([columns["y_ref"].to_numpy(), columns["x_ref"].to_numpy()], axis=1)
-    distance = neighbour_distance(place)
-    if distance is None:
-        raise SettingsError(
-            "one column alone does not tell how large its window should be",
-            "setting window_px (FitSettings)",
-            "two columns or more, or a window",
-            "one column",
-            "Give --window-px",
-        )
-    return distance
-
-
 def frame_times(movie: Movie) -> Floats:
     """Return the start of each frame in s; the frame's number where the frame time is not known."""
     return np.arange(movie.n_frames, dtype=np.float64) * (movie.frame_time_s or 1.0)
-
-
-@lru_cache(maxsize=4)
-def load_job(movie: Movie, path: Path, key: str) -> Job:
-    """Return what the tasks of one fit stage share, from the stores; ``key`` tells one stage from the next."""
-    store = datasets.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
-    about = metadata.attributes(path)
-    if about.get("key") != key:
-        raise left_over(path, f"key {key}", f"key {about.get('key')}")
-    bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
-    vacuum = tuple(about["vacuum"]) if about["vacuum"] else None
-    settings = from_toml(FitSettings, about["settings"], str(path))
-    drift = store["drift_measured"].to_numpy()
-    reference = _reference(store, about["reference_blur_px"], settings)
-    return Job(reference, drift, bad, about["window"], vacuum, about["refine_columns"], settings)
-
-
-def _reference(columns: xr.Dataset, blur_sigma_px: float, settings: FitSettings) -> Floats:
-    """Return the fit on the summed image, which went through that blur, as it would be after that of the windows.
-
-    Columns that have none get the median shape at their seed's place.
-    """
-    reference: Floats = columns["fit_ref"].to_numpy().astype(np.float64)
-    known = np.isfinite(reference).all(axis=1)
-    if not known.any():
-        raise SettingsError(
-            "no column could be fitted in the summed image",
-            "columns",
-            "at least one",
-            "0",
-            "Check the contrast and the seeds",
-        )
-    reference[~known] = np.median(reference[known], axis=0)
-    reference[:, X] = np.where(known, reference[:, X], columns["x_ref"].to_numpy())
-    reference[:, Y] = np.where(known, reference[:, Y], columns["y_ref"].to_numpy())
-    return blurred(reference, settings.window_blur_px**2 - blur_sigma_px**2)
 
 
 def calibration(movie: Movie) -> dict[str, float | None]:

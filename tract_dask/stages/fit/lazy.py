@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
-import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from ...kernels.gaussian.intensity import Floats
 from ...settings.run import FitSettings
 from ...store import results, schema
 from ...store.movie import Movie
 from .job import calibration, frame_times, prepare
-from .measure import measure
+from .measure import Values, measure
 
 
 def fit_columns(
@@ -54,43 +48,23 @@ def fit_columns(
         Where float32 does not hold the pixels (:func:`tract_dask.stages.pixel_range.check_pixels`).
     """
     import dask.array as da  # takes its time, and workers do not need it
+    from dask import delayed
 
     job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed)
-    n_columns = len(job.reference)
-    names = [name for name in schema.RESULTS if name not in ("time", "drift_measured")]
-    sizes = {"frame": movie.n_frames, "column_id": n_columns} | schema.SIZES
-    chunk = {shard.index: shard for shard in movie.shards}
+    sizes = {"frame": movie.n_frames, "column_id": len(job.reference)} | schema.SIZES
+    fitted = {name: of for name, of in schema.RESULTS.items() if name not in ("time", "drift_measured")}
 
-    def fit_packed(index: NDArray[np.int64]) -> Floats:
-        values = measure(movie, chunk[int(index[0])], job)
-        return np.concatenate(
-            [values[name].reshape(len(values["noise"]), -1) for name in names], axis=1, dtype=np.float64
-        )
+    def fit_shard(index: int) -> Values:
+        values = measure(movie, movie.shards[index], job)
+        return {name: values[name].astype(of.dtype) for name, of in fitted.items()}
 
-    tails = {name: tuple(sizes[dim] for dim in schema.RESULTS[name].dims[1:]) for name in names}
-    width = sum(math.prod(tail) for tail in tails.values())
-    packed = da.map_blocks(
-        fit_packed,
-        da.arange(len(chunk), chunks=1),
-        new_axis=1,
-        chunks=(tuple(shard.frames for shard in movie.shards), (width,)),
-        dtype=np.float64,
-        name=False,
-    )
-    dataset = columns.assign_coords(schema.coordinates(movie.n_frames)).assign(_unpacked(packed, tails))
+    shards = [delayed(fit_shard, pure=False)(index) for index in range(len(movie.shards))]
+    dataset = columns.assign_coords(schema.coordinates(movie.n_frames))
+    for name, of in fitted.items():
+        shapes = [(shard.frames, *(sizes[dim] for dim in of.dims[1:])) for shard in movie.shards]
+        blocks = [da.from_delayed(fits[name], shape, of.dtype) for fits, shape in zip(shards, shapes, strict=True)]
+        dataset[name] = (of.dims, da.concatenate(blocks), of.attributes)
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", frame_times(movie), schema.RESULTS["time"].attributes)
-    blur = columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px)
-    dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window, blur)
+    dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window_px, job.reference_blur_px)
     return dataset
-
-
-def _unpacked(packed: Any, tails: dict[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Return the variables that lie side by side in an array (frames, values), each of a shape ``tails`` a frame."""
-    variables, offset = {}, 0
-    for name, tail in tails.items():
-        variable, count = schema.RESULTS[name], math.prod(tail)
-        block = packed[:, offset : offset + count].reshape((len(packed), *tail))
-        variables[name] = (variable.dims, block.astype(variable.dtype), variable.attributes)
-        offset += count
-    return variables

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.blur import Tiles, cut_windows, gaussian_kernel
 from ...kernels.centroids import BEST_RADIUS, SMALLEST_RADIUS_PX, window_centroids
-from ...kernels.gaussian.fit import GaussianFits, fit_gaussians
+from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.intensity import INTENSITY_SCALE, Floats, intensities
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.presence import strengths
@@ -33,79 +35,143 @@ _AT_BOUND = 1e-9
 """Share of the interval between its bounds within which a parameter is at its bound."""
 
 
-def measure(movie: Movie, shard: Shard, job: Job) -> Values:
+@dataclass(frozen=True)
+class FrameFits:
+    """What the windows of some frames give, (frames, columns, ...), at first in the coordinates of the windows.
+
+    Standard errors are NaN after a filter of whole frames: there is no theory of its noise. A fit is ``held`` where a
+    bound other than that of a sigma is active. Centroids are (y, x); strengths are those of the matched filters.
+    Residuals (rms) are NaN where there is vacuum, and so no need of them.
+    """
+
+    estimates: Floats
+    stderr: Floats
+    volume_stderr: Floats
+    r_squared: NDArray[np.float32]
+    n_iterations: NDArray[np.int16]
+    converged: NDArray[np.bool_]
+    at_bound: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+    centroid: Floats
+    strength: Floats
+    residual: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence[FrameFits], shape: tuple[int, ...]) -> FrameFits:
+        """Return fits of successive windows, (windows, ...), as those of ``shape`` (frames, columns)."""
+        fields = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+        return cls(**{name: values.reshape(*shape, *values.shape[1:]) for name, values in fields.items()})
+
+    def without(self, outside: NDArray[np.bool_], bad: NDArray[np.bool_]) -> FrameFits:
+        """Return the same with NaN for windows ``outside`` (frames, columns), and for centroids of ``bad`` frames."""
+        names = ("estimates", "stderr", "volume_stderr", "r_squared", "centroid", "strength", "residual")
+        blank: dict[str, Any] = {name: vars(self)[name].copy() for name in names}
+        for values in blank.values():
+            values[outside] = np.nan
+        blank["centroid"][bad] = np.nan
+        return replace(self, **blank, n_iterations=self.n_iterations * ~outside)
+
+    def moved(self, offset: NDArray[Any]) -> FrameFits:
+        """Return the same with positions moved by ``offset`` in (y, x), (frames, columns or 1, 2)."""
+        estimates = self.estimates.copy()
+        estimates[..., [Y, X]] += offset
+        return replace(self, estimates=estimates, centroid=self.centroid + offset)
+
+    def scaled(self, unit: float) -> FrameFits:
+        """Return the same with amplitudes, backgrounds and the errors of volumes times ``unit``, a power of two."""
+        factor = np.ones(7)
+        factor[[AMPLITUDE, BACKGROUND]] = unit
+        counts: dict[str, Any] = {name: vars(self)[name] * factor for name in ("estimates", "stderr")}
+        return replace(self, **counts, volume_stderr=self.volume_stderr * unit)
+
+
+class _Places(NamedTuple):
+    """Where the windows and the vacuum lie in some frames of a movie, from frame ``start`` on."""
+
+    start: int
+    drift: Floats
+    bad: NDArray[np.bool_]
+    corner: NDArray[np.int64]
+    """(frames, columns, 2) first row and column of each window."""
+    outside: NDArray[np.bool_]
+    """(frames, columns) whether it leaves the frame."""
+    vacuum: NDArray[np.int64] | None
+    """(frames, 3) first row, first column and side of the square whose noise is measured, if there is vacuum."""
+
+    @classmethod
+    def of(cls, movie: Movie, start: int, stop: int, job: Job) -> _Places:
+        drift, shape = job.drift[start:stop], np.array(movie.shape[1:])
+        corner = np.rint(job.reference[None, :, [Y, X]] + drift[:, None]).astype(np.int64) - job.window_px // 2
+        outside = np.any((corner < 0) | (corner + job.window_px > shape), axis=-1)
+        return cls(start, drift, job.bad[start:stop], corner, outside, _vacuum(job, drift, shape))
+
+    def boxes(self, job: Job) -> NDArray[np.int64]:
+        """Return what is needed of the frames, as :meth:`Movie.read_tiles` takes it."""
+        halo = gaussian_kernel(job.settings.noise_blur_px).size // 2
+        corner = self.corner[~self.outside]
+        boxes = [np.concatenate([corner - halo, corner + job.window_px + halo], axis=-1)]
+        if self.vacuum is not None:
+            first, side = self.vacuum[:, :2], self.vacuum[:, 2:]
+            boxes.append(np.concatenate([first - halo, first + side + halo], axis=-1))
+        return np.concatenate(boxes)
+
+
+def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Values:
     """Return the values of every fitted variable of :data:`schema.RESULTS` for the frames of one shard.
 
     Windows are cut where the drift has carried the columns: its integer part picks the pixels, its fraction shifts the
     start of the fit. No pixel is resampled. One layer of tiles is in memory at a time; with a filter of whole frames
-    beside it one filtered frame.
+    beside it one filtered frame. ``whole`` reads whole frames, which need not begin with a layer of tiles.
     """
-    parts: list[Values] = []
-    for start in range(shard.start, shard.stop, movie.layer_frames):
-        stop = min(start + movie.layer_frames, shard.stop)
-        if job.settings.filters_frames:
-            frames = movie.read(start, stop)
-            parts += [_measure_frames(movie, k, k + 1, job, frame) for k, frame in enumerate(frames, start)]
-        else:
-            parts.append(_measure_frames(movie, start, stop, job))
+    job = job.in_units
+    whole = whole or job.settings.filters_frames
+    parts = [_measure_frames(*pixels, job) for pixels in _read(movie, shard, job, whole)]
     return {name: np.concatenate([values[name] for values in parts]) for name in parts[0]}
 
 
-def measure_frame(movie: Movie, frame: int, job: Job) -> Values:
-    """Return the same as :func:`measure` for a single frame, whose arrays have length 1 along it."""
-    return _measure_frames(movie, frame, frame + 1, job, movie.read(frame, frame + 1)[0])
+def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[_Places, Tiles, float]]:
+    """Yield what lies where, the pixels, and the gain that these still lack: of a layer of tiles, or a whole frame."""
+    gain = movie.gain / job.unit
+    for start in range(shard.start, shard.stop, movie.layer_frames):
+        stop = min(start + movie.layer_frames, shard.stop)
+        if not whole:
+            places = _Places.of(movie, start, stop, job)
+            yield places, movie.read_tiles(start, stop, places.boxes(job)), gain
+            continue
+        for number, pixels in enumerate(movie.read(start, stop), start):
+            filters = job.settings.filters_frames
+            frame, lacking = (filter_frame(pixels, job.settings, gain), 1.0) if filters else (pixels, gain)
+            tiles = Tiles(frame[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
+            yield _Places.of(movie, number, number + 1, job), tiles, lacking
 
 
-def _measure_frames(movie: Movie, start: int, stop: int, job: Job, frame: np.ndarray[Any, Any] | None = None) -> Values:
-    """Return the values for frames ``start`` to ``stop`` (not included) of one shard.
-
-    They begin with the first of a layer of tiles, or are a single one, ``frame``, which has been read.
-    """
-    job, unit = job.in_units, job.unit
-    drift, gain = job.drift[start:stop], movie.gain / unit
-    place = job.reference[None, :, [Y, X]] + drift[:, None]
-    corner = np.rint(place).astype(np.int64) - job.window // 2
-    outside = np.any((corner < 0) | (corner + job.window > np.array(movie.shape[1:])), axis=-1)
-    vacuum = _vacuum(job, drift, movie.shape[1:])
-    bad = np.broadcast_to(job.bad[start:stop, None], outside.shape)
-    if frame is None:
-        tiles = _read(movie, start, stop, job, corner[~outside], vacuum)
-    else:
-        whole = job.settings.filters_frames
-        pixels, gain = (filter_frame(frame, job.settings, gain), 1.0) if whole else (frame, gain)
-        tiles = Tiles(pixels[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
-    fits, centroid, presence, residual, held = _fit(tiles, corner, drift[:, None] - corner, job, gain)
-    fits.estimates[..., [Y, X]] += corner
-    centroid += corner
-    centroid[outside | bad] = np.nan
-    for array in (fits.estimates, fits.stderr, fits.volume_stderr, fits.r_squared, presence, residual):
-        array[outside] = np.nan
-    noise, precision, empty = _vacuum_noise(tiles, vacuum, residual, start, job, gain)
-    status = _status(fits, held, outside, bad, job.settings.threshold * noise)
-    refined: Floats = drift + common_motion(fits, status, drift, job)
-    fits.estimates[..., [Y, X]] -= refined[:, None]
-    for counts in (fits.estimates, fits.stderr):
-        counts[..., [AMPLITUDE, BACKGROUND]] *= unit
+def _measure_frames(places: _Places, tiles: Tiles, gain: float, job: Job) -> Values:
+    """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
+    in_frame = _fit(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
+    noise, precision, empty = _vacuum_noise(places, tiles, gain, in_frame.residual, job)
+    status = _status(in_frame, places, job.settings.threshold * noise)
+    drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
+    fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale)
     return {
         "fit": fits.estimates,
         "stderr": fits.stderr,
-        "centroid": centroid - refined[:, None],
+        "centroid": fits.centroid,
         "intensity": intensity,
         "intensity_error": intensity_error,
-        "intensity_stderr": INTENSITY_SCALE[job.settings.intensity_scale] * unit * fits.volume_stderr,
+        "intensity_stderr": INTENSITY_SCALE[job.settings.intensity_scale] * fits.volume_stderr,
         "status": status,
-        "presence": presence * precision,
+        "presence": fits.strength * precision,
         "presence_vacuum": empty * precision,
         "r_squared": fits.r_squared,
-        "n_iterations": fits.n_iterations * ~outside,
-        "drift": refined,
-        "noise": unit * noise,
+        "n_iterations": fits.n_iterations,
+        "drift": drift,
+        "noise": job.unit * noise,
     }
 
 
 def _vacuum_noise(
-    tiles: Tiles, vacuum: NDArray[np.int64] | None, residual: Floats, start: int, job: Job, gain: float
+    places: _Places, tiles: Tiles, gain: float, residual: Floats, job: Job
 ) -> tuple[Floats, Floats, NDArray[np.float32]]:
     """Return the noise (frames), what turns matched filters into strengths (frames, 1), and those of empty places.
 
@@ -114,84 +180,89 @@ def _vacuum_noise(
     """
     blur = job.settings.noise_blur_px
     empty = np.full((len(residual), SIZES["place"]), np.nan, np.float32)
-    if vacuum is None:
+    if places.vacuum is None:
         noise = _damping(job.settings) * masked_median(residual, np.isfinite(residual))
     else:
-        squares = _squares(tiles, vacuum, blur, gain)
+        squares = _squares(tiles, places.vacuum, blur, gain)
         with np.errstate(invalid="ignore"):  # pixels of bad frames
             noise = np.asarray(squares.reshape(len(squares), -1).std(axis=1), dtype=np.float64)
         if job.settings.window_blur_px != blur:
-            squares = _squares(tiles, vacuum, job.settings.window_blur_px, gain)
-        empty = _empty_strengths(squares, start, job)
+            squares = _squares(tiles, places.vacuum, job.settings.window_blur_px, gain)
+        empty = _empty_strengths(squares, places.start, job)
     with np.errstate(divide="ignore", invalid="ignore"):  # vacuum without noise
         return noise, _white_noise_left(blur) / noise[:, None], empty
 
 
-def _status(
-    fits: GaussianFits, held: NDArray[np.bool_], outside: NDArray[np.bool_], bad: NDArray[np.bool_], weakest: Floats
-) -> NDArray[np.uint8]:
+def _status(fits: FrameFits, places: _Places, weakest: Floats) -> NDArray[np.uint8]:
     """Return what speaks against each fit, (frames, columns); ``weakest`` (frames) is the smallest good amplitude."""
-    weak = ~(np.abs(fits.estimates[..., AMPLITUDE]) > weakest[:, None])
+    inside = ~places.outside
     flags = {
-        Status.BELOW_NOISE: weak & ~outside,
-        Status.NOT_CONVERGED: ~fits.converged & ~outside,
-        Status.AT_BOUND: held & ~outside,
-        Status.SHAPE_AT_BOUND: fits.at_bound & ~held & ~outside,
-        Status.OUTSIDE_FRAME: outside,
-        Status.BAD_FRAME: bad,
+        Status.BELOW_NOISE: ~(np.abs(fits.estimates[..., AMPLITUDE]) > weakest[:, None]) & inside,
+        Status.NOT_CONVERGED: ~fits.converged & inside,
+        Status.AT_BOUND: fits.held & inside,
+        Status.SHAPE_AT_BOUND: fits.at_bound & ~fits.held & inside,
+        Status.OUTSIDE_FRAME: places.outside,
+        Status.BAD_FRAME: places.bad[:, None],
     }
-    status = np.zeros(outside.shape, np.uint8)
+    status = np.zeros(inside.shape, np.uint8)
     for flag, found in flags.items():
         status |= np.uint8(flag) * found
     return status
 
 
-def _fit(
-    tiles: Tiles, corner: NDArray[np.int64], offset: Floats, job: Job, gain: float
-) -> tuple[GaussianFits, Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Return fits (frames, columns, ...), centroids (y, x), strengths of matched filters, residuals, which are held.
+def _fit(places: _Places, tiles: Tiles, gain: float, job: Job) -> FrameFits:
+    """Return what the windows give, in their coordinates.
 
-    Residuals (rms) are NaN where there is vacuum, and so no need of them. A fit is held where a bound other than that
-    of a sigma is active. A batch of frames is cut, blurred and fitted at a time, so small that its windows stay in the
-    processor's cache. Standard errors are NaN after a filter of whole frames: there is no theory of its noise.
+    A batch of frames is cut, blurred and fitted at a time, so small that its windows stay in the processor's cache.
     """
-    settings, size = job.settings, job.window
-    count = corner.shape[:2]
-    first, lower, upper = _bounds(job, offset, size)
-    batch = max(1, _BATCH_BYTES // (4 * size * size * count[1]))
-    parts: list[tuple[Any, ...]] = []
-    for start in range(0, count[0], batch):
+    n_frames, n_columns = places.outside.shape
+    batch = max(1, _BATCH_BYTES // (4 * job.window_px**2 * n_columns))
+    bounds, parts = _bounds(places, job), []
+    for start in range(0, n_frames, batch):
         part = slice(start, start + batch)
-        y, x = corner[part, :, 0], corner[part, :, 1]
-        windows = cut_windows(tiles, y, x, size, settings.window_blur_px, gain, start).reshape(-1, size, size)
-        fits = fit_gaussians(
-            windows,
-            *(values[part].reshape(-1, 7) for values in (first, lower, upper)),
-            estimator=settings.estimator,
-            fixed_shape=settings.shape == "fixed",
-            blur_sigma_px=settings.window_blur_px,
-            tolerance_px=settings.tolerance_px,
-            max_iterations=settings.max_iterations,
-            radius_px=size / 2,
-            counting=settings.counting,
-        )
-        if settings.filters_frames:
-            fits.stderr[:], fits.volume_stderr[:] = np.nan, np.nan
-        centroid = _centroids(windows, first[part], job)
-        strength = strengths(windows, job.filters, np.arange(len(windows)) % count[1]).astype(np.float64)
-        residual = np.full(len(windows), np.nan)
-        if job.vacuum is None:
-            with np.errstate(invalid="ignore"):  # windows of bad frames
-                residual = np.sqrt((1 - fits.r_squared) * windows[:, _disc(size)].var(axis=1, dtype=np.float64))
-        parts.append((*fits, centroid, strength, residual))
-    fields = (np.concatenate(values).reshape(*count, *values[0].shape[1:]) for values in zip(*parts, strict=True))
-    *joined, centroid, strength, residual = fields
-    fitted = GaussianFits(*joined)
-    held = np.zeros(count, np.bool_)
+        y, x = places.corner[part, :, 0], places.corner[part, :, 1]
+        windows = cut_windows(tiles, y, x, job.window_px, job.settings.window_blur_px, gain, start)
+        parts.append(_fit_windows(windows.reshape(-1, *windows.shape[2:]), [values[part] for values in bounds], job))
+    return FrameFits.joined(parts, places.outside.shape)
+
+
+def _fit_windows(windows: NDArray[np.float32], bounds: Sequence[Floats], job: Job) -> FrameFits:
+    """Return what windows (n, h, w) give, with start values and bounds (frames, columns, 7) in their coordinates."""
+    settings, (start, lower, upper) = job.settings, bounds
+    fits = fit_gaussians(
+        windows,
+        *(values.reshape(-1, 7) for values in bounds),
+        estimator=settings.estimator,
+        fixed_shape=settings.shape == "fixed",
+        blur_sigma_px=settings.window_blur_px,
+        tolerance_px=settings.tolerance_px,
+        max_iterations=settings.max_iterations,
+        radius_px=job.window_px / 2,
+        counting=settings.counting,
+    )
+    if settings.filters_frames:
+        fits.stderr[:], fits.volume_stderr[:] = np.nan, np.nan
+    held, residual = np.zeros(len(windows), np.bool_), np.full(len(windows), np.nan)
     for k in (AMPLITUDE, X, Y, BACKGROUND):
-        low, high, value = lower[..., k], upper[..., k], fitted.estimates[..., k]
+        low, high, value = lower[..., k].ravel(), upper[..., k].ravel(), fits.estimates[:, k]
         held |= np.minimum(value - low, high - value) < _AT_BOUND * (high - low)
-    return fitted, centroid, strength, residual, held
+    if job.vacuum is None:
+        with np.errstate(invalid="ignore"):  # windows of bad frames
+            variance = windows[:, _disc(job.window_px)].var(axis=1, dtype=np.float64)
+            residual = np.sqrt((1 - fits.r_squared) * variance)
+    return FrameFits(
+        fits.estimates,
+        fits.stderr,
+        fits.volume_stderr,
+        fits.r_squared,
+        fits.n_iterations,
+        fits.converged,
+        fits.at_bound,
+        held,
+        _centroids(windows, start, job),
+        strengths(windows, job.filters, np.arange(len(windows)) % start.shape[1]).astype(np.float64),
+        residual,
+    )
 
 
 def _centroids(windows: NDArray[np.float32], start: Floats, job: Job) -> Floats:
@@ -224,11 +295,9 @@ def _white_noise_left(sigma: float) -> float:
     return float((gaussian_kernel(sigma) ** 2).sum())
 
 
-def _bounds(job: Job, offset: Floats, size: int) -> tuple[Floats, Floats, Floats]:
-    """Return start values and bounds, each (frames, columns, 7), in the coordinates of the windows.
-
-    ``offset`` (frames, columns, 2) leads from the summed image to the window: drift less corner, (y, x).
-    """
+def _bounds(places: _Places, job: Job) -> tuple[Floats, Floats, Floats]:
+    """Return start values and bounds, each (frames, columns, 7), in the coordinates of the windows."""
+    offset = places.drift[:, None] - places.corner  # from the summed image to the window
     settings, reference = job.settings, job.reference
     amplitude = settings.amplitude_factor * reference[:, AMPLITUDE]
     span = np.abs(reference[:, BACKGROUND]) + np.abs(amplitude)
@@ -253,10 +322,10 @@ def _bounds(job: Job, offset: Floats, size: int) -> tuple[Floats, Floats, Floats
 
 def _reach(job: Job) -> float:
     """Return how far a column may be from its place in the summed image, along x and along y, px."""
-    return min(job.settings.max_shift_px or job.window / 4, job.window / 2)
+    return min(job.settings.max_shift_px or job.window_px / 4, job.window_px / 2)
 
 
-def _vacuum(job: Job, drift: Floats, shape: tuple[int, ...]) -> NDArray[np.int64] | None:
+def _vacuum(job: Job, drift: Floats, shape: NDArray[np.int64]) -> NDArray[np.int64] | None:
     """Return where the noise is measured: in each frame the first row and column, and the side, of a square; (f, 3).
 
     It is the middle of the vacuum box, no larger than what the noise takes, moved with the drift and kept inside the
@@ -267,20 +336,8 @@ def _vacuum(job: Job, drift: Floats, shape: tuple[int, ...]) -> NDArray[np.int64
     y0, y1, x0, x1 = job.vacuum
     side = min(y1 - y0, x1 - x0, _NOISE_SIDE_PX)
     corner = np.array([y0 + y1 - side, x0 + x1 - side]) // 2 + np.rint(drift).astype(np.int64)
-    corner = np.clip(corner, 0, np.array(shape) - side)
+    corner = np.clip(corner, 0, shape - side)
     return np.column_stack([corner, np.full(len(corner), side)])
-
-
-def _read(
-    movie: Movie, start: int, stop: int, job: Job, corner: NDArray[np.int64], vacuum: NDArray[np.int64] | None
-) -> Tiles:
-    """Return the tiles of some frames that the windows (first row and column of each), or the vacuum, touch."""
-    halo = gaussian_kernel(job.settings.noise_blur_px).size // 2
-    boxes = [np.concatenate([corner - halo, corner + job.window + halo], axis=-1)]
-    if vacuum is not None:
-        first, side = vacuum[:, :2], vacuum[:, 2:]
-        boxes.append(np.concatenate([first - halo, first + side + halo], axis=-1))
-    return movie.read_tiles(start, stop, np.concatenate(boxes))
 
 
 def _squares(tiles: Tiles, vacuum: NDArray[np.int64], blur_sigma_px: float, gain: float) -> NDArray[np.float32]:
@@ -295,10 +352,10 @@ def _empty_strengths(squares: NDArray[np.float32], start: int, job: Job) -> NDAr
     next, whichever shard the frame is in.
     """
     n_frames, n_places, side = len(squares), SIZES["place"], math.isqrt(SIZES["place"])
-    if squares.shape[-1] < job.window:
+    if squares.shape[-1] < job.window_px:
         return np.full((n_frames, n_places), np.nan, np.float32)
-    corners = np.rint(np.linspace(0, squares.shape[-1] - job.window, side)).astype(int)
-    windows = [squares[:, y : y + job.window, x : x + job.window] for y in corners for x in corners]
+    corners = np.rint(np.linspace(0, squares.shape[-1] - job.window_px, side)).astype(int)
+    windows = [squares[:, y : y + job.window_px, x : x + job.window_px] for y in corners for x in corners]
     which = (start + np.arange(n_frames)[:, None] + np.arange(n_places)) % len(job.reference)
-    found = strengths(np.stack(windows, axis=1).reshape(-1, job.window, job.window), job.filters, which.ravel())
+    found = strengths(np.stack(windows, axis=1).reshape(-1, job.window_px, job.window_px), job.filters, which.ravel())
     return found.reshape(n_frames, n_places)

@@ -19,11 +19,11 @@ from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.keys import counted
 from ...store.movie import Movie
 from ...store.parts import DamagedPartError, write
-from ...store.provenance import processor, provenance, stage_key, widths
+from ...store.provenance import processor, stage_key, widths
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done
-from .job import Job, calibration, frame_times, load_job, prepare
+from .job import Job, calibration, frame_times, prepare
 from .join import join
 from .measure import measure
 
@@ -43,7 +43,7 @@ class FitSummary:
 
 
 def fit_movie(
-    movie: Movie, columns: xr.Dataset, job: Job, path: Path, *, client: Client | None = None, on_event: Sink = silent
+    movie: Movie, job: Job, path: Path, *, client: Client | None = None, on_event: Sink = silent
 ) -> FitSummary:
     """Fit every column in every frame into the store at ``path``; go on where an earlier call stopped.
 
@@ -52,12 +52,12 @@ def fit_movie(
     Parameters
     ----------
     job
-        From :func:`prepare`, with the same movie and columns.
+        From :func:`prepare`, with the same movie.
     client
         The cluster to run on; None runs in this process.
     """
     started = perf_counter()
-    key = fit_key(movie, columns, job)
+    key = fit_key(movie, job)
     about = metadata.attributes(path)
     if about.get("key") == key and about.get("complete"):
         remove_journal(journal_beside(path))  # of a run that was killed just before it had removed it
@@ -65,19 +65,7 @@ def fit_movie(
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
     if not _goes_on(path, key, on_event):
-        results.create(
-            path,
-            columns,
-            job.drift,
-            frame_times(movie),
-            movie.shards[0].frames,
-            **provenance(key, job.settings, str(movie.path)),
-            **calibration(movie),
-            window=job.window,
-            vacuum=job.vacuum,
-            reference_blur_px=columns.attrs.get("blur_sigma_px", job.settings.blur_sigma_px),
-            refine_columns=job.refined_by,
-        )
+        job.save(path, movie, key)
     journal = Journal(journal_beside(path), key, dict.fromkeys(_COUNTS, ()))
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
@@ -137,17 +125,17 @@ def _fit_shards(
     return summary, processors
 
 
-def fit_key(movie: Movie, columns: xr.Dataset, job: Job) -> str:
+def fit_key(movie: Movie, job: Job) -> str:
     """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
-    arrays = (job.reference, job.drift, columns["column_id"].to_numpy().astype(np.int64))
+    arrays = (job.reference, job.drift, job.columns["column_id"].to_numpy().astype(np.int64))
     vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
-    numbers = [movie.gain, int(job.window), vacuum, job.refined_by]
-    kinds = [str(kind) for kind in columns["kind"].to_numpy()]
+    numbers = [movie.gain, int(job.window_px), vacuum, job.refined_by]
+    kinds = [str(kind) for kind in job.columns["kind"].to_numpy()]
     return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
 
 
 def _fit_task(movie: Movie, path: Path, key: str, run: Path, shard: Shard) -> Payload:
-    job = load_job(movie, path, key)
+    job = Job.load(path, movie, key)
     values = measure(movie, shard, job)
     write(run, shard, values, movie.shards[0].frames)
     fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
@@ -171,5 +159,5 @@ def fit_stage(
 ) -> FitSummary:
     """Fit every column in every frame into ``path``."""
     job = prepare(movie, columns, drift, settings, summed=summed)
-    client = None if is_done(path, fit_key(movie, columns, job)) else workers()
-    return fit_movie(movie, columns, job, path, client=client, on_event=on_event)
+    client = None if is_done(path, fit_key(movie, job)) else workers()
+    return fit_movie(movie, job, path, client=client, on_event=on_event)

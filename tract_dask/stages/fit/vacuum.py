@@ -62,9 +62,9 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
 
 
 def check_box(
-    box: tuple[int, ...],
+    box: tuple[int, ...] | None,
     shape: tuple[int, ...],
-    drift: NDArray[np.float64],
+    drift: NDArray[np.float64] | None,
     where: str = "setting vacuum_box (FitSettings)",
 ) -> None:
     """Check that a vacuum box stays inside the frame whatever the drift; ``where`` is what an error names.
@@ -72,18 +72,20 @@ def check_box(
     Parameters
     ----------
     drift
-        (frames, 2) in px; one row of zeros where it is not known yet.
+        (frames, 2) in px; None where it is not known yet: then only a box that no drift brings inside is refused.
 
     Raises
     ------
     SettingsError
         Naming the first frame where it leaves.
     """
+    if box is None:
+        return
     if len(box) != 4 or box[0] >= box[1] or box[2] >= box[3]:
         raise SettingsError(
             "this is not a box", where, "y0, y1, x0, x1 with y0 < y1 and x0 < x1", str(box), "Correct it"
         )
-    shift = np.rint(drift).astype(int)
+    shift = np.rint(np.zeros((1, 2)) if drift is None else drift).astype(int)
     inside = (
         (shift[:, 0] + box[0] >= 0)
         & (shift[:, 0] + box[1] <= shape[0])
