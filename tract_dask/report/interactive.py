@@ -11,8 +11,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from .pictures import grey_data, grey_levels
-from .survey import QUANTITIES, Survey, frame_curve
+from ..analysis.overview import QUANTITIES
+from ..kernels.greys import block_means, grey_levels
+from .pictures import grey_data
+from .survey import Survey, frame_curves
 
 _IMAGE_PX = 900
 _MISSING = -32768
@@ -63,8 +65,8 @@ def page_data(run: Survey, first: int) -> dict[str, Any]:
 def image_data(run: Survey) -> tuple[str, dict[str, Any]]:
     """Return the summed image as a data URL; and its size, how many px the picture covers, the size of a pixel."""
     exposed = (run.summed["exposure"] > 0).to_numpy()
-    levels = grey_levels(run.summed["image"].to_numpy(), exposed, _IMAGE_PX)
     step = -(-max(exposed.shape) // _IMAGE_PX)
+    levels = grey_levels(block_means(np.where(exposed, run.summed["image"], np.nan), step))
     ny, nx = exposed.shape
     covered = [side * step for side in reversed(levels.shape)]
     size = run.scale if run.unit == "pm" else None
@@ -136,9 +138,9 @@ def quantised(values: NDArray[np.float64]) -> tuple[NDArray[np.int16], NDArray[n
 
 def _frames(run: Survey) -> dict[str, Any]:
     """Return the curves over the frames: drift, the share of accepted fits, and the correlation with the sum."""
-    curve = frame_curve(run.frames)
+    curve = frame_curves(run.frames)
     data = {"time": curve["time"], "share": 100 * curve["share"]}
-    data |= {axis: run.scale * curve["drift"].sel(axis=axis) for axis in ("x", "y")}
+    data |= {axis: run.scale * curve[f"drift_{axis}"] for axis in ("x", "y")}
     if "quality" in curve:
         data["quality"] = 100 * curve["quality"]
-    return {name: packed(values.to_numpy().astype(float)) for name, values in data.items()}
+    return {name: packed(values) for name, values in data.items()}

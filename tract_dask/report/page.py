@@ -231,7 +231,7 @@ def first_column(run: Survey) -> int:
 
 def worst_columns(run: Survey) -> list[dict[str, Any]]:
     """Return the columns that are worth a look: few accepted fits, a large residual, a spread beyond the errors."""
-    columns = run.columns.drop_vars(["parameter", "unit", "fit_ref"], errors="ignore")
+    columns = run.columns
     rank = {
         "few accepted fits": -np.nan_to_num(columns["share"].to_numpy(), nan=0.0),
         "large residual": np.nan_to_num(columns["residual"].to_numpy(), nan=-np.inf),
