@@ -21,10 +21,44 @@ Flags = NDArray[np.bool_]
 QUANTITIES = ("x", "y", "intensity")
 SERIES = (*QUANTITIES, *(f"{name}_stderr" for name in QUANTITIES))
 FRAME = ("fits", "accepted", "bad", "amplitude", "drift_y", "drift_x")
+_NOT_FITTED = Status.OUTSIDE_FRAME | Status.BAD_FRAME
 _FLAGS = ("below_noise", "not_converged", "at_bound", "shape_at_bound")
 COUNTS = ("fits", "accepted", "outside", *_FLAGS)
 MEANS = ("x", "y", "intensity", "r_squared", "variance")
 _READ = ("fit", "stderr", "intensity", "intensity_stderr", "r_squared", "status", "drift")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the numbers of results mean; None: not known."""
+
+    pixel_size_pm: float | None
+    frame_time_s: float | None
+    dose: float | None
+
+    @classmethod
+    def of(cls, about: Mapping[str, Any]) -> Self:
+        """Return what the attributes of results say."""
+        return cls(about.get("pixel_size_pm"), about.get("frame_time_s"), about.get("dose"))
+
+    @property
+    def scale(self) -> float:
+        """Lengths in :attr:`unit` for one px."""
+        return self.pixel_size_pm or 1.0
+
+    @property
+    def unit(self) -> str:
+        """Of lengths."""
+        return "pm" if self.pixel_size_pm else "px"
+
+    @property
+    def time_unit(self) -> str:
+        """Of times: frames where the time of one is not known."""
+        return "s" if self.frame_time_s else "frames"
+
+    def times(self, frames: Floats) -> Floats:
+        """Return the times of frames."""
+        return frames * (self.frame_time_s or 1.0)
 
 
 @dataclass(frozen=True)
@@ -107,7 +141,7 @@ class Part:
     def __init__(self, opened: Callable[[str], Any], start: int, stop: int) -> None:
         found = {name: np.asarray(opened(name)[start:stop]) for name in _READ}
         fit, stderr, self._status = found["fit"], found["stderr"], found["status"]
-        self._fitted, self._accepted = fitted(self._status), (self._status & int(REJECTED)) == 0
+        self._fitted, self._accepted = ((self._status & int(flags)) == 0 for flags in (_NOT_FITTED, REJECTED))
         self._r_squared, self._amplitude, self._drift = found["r_squared"], fit[..., AMPLITUDE], found["drift"]
         own, errors = (fit, "intensity"), (stderr, "intensity_stderr")
         self.series: Floats = np.stack(
@@ -137,11 +171,6 @@ class Part:
 
     def _has(self, flag: Status) -> Flags:
         return np.asarray((self._status & int(flag)) > 0)
-
-
-def fitted(status: NDArray[np.uint8]) -> Flags:
-    """Tell which fits were made: neither does the window leave the frame, nor has the frame bad pixels."""
-    return np.asarray((status & int(Status.OUTSIDE_FRAME | Status.BAD_FRAME)) == 0)
 
 
 def frame_curves(frames: Mapping[str, Floats], step: int) -> dict[str, Floats]:

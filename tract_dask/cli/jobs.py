@@ -27,22 +27,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 TOKEN_VARIABLE = "TRACT_DASK_TOKEN"
 
-_CODES = {
-    State.FAILED: ExitCode.FAILED,
-    State.CANCELLED: ExitCode.FAILED,
-    State.DONE_WITH_FAILED_FRAMES: ExitCode.BAD_FRAMES,
-}
+_CODES = dict.fromkeys((State.FAILED, State.CANCELLED), ExitCode.FAILED)
+_CODES[State.DONE_WITH_FAILED_FRAMES] = ExitCode.BAD_FRAMES
 """Exit codes of the jobs that one watches to their end, as those of a run."""
 
 _FILE_WIDTH = 250
-_COLOURS = {
-    State.RUNNING: "cyan",
-    State.WAITING: "yellow",
-    State.DONE: "green",
-    State.DONE_WITH_FAILED_FRAMES: "yellow",
-    State.FAILED: "red",
-    State.CANCELLED: "dim",
-}
+_COLOURS = {State.RUNNING: "cyan", State.DONE: "green", State.FAILED: "red", State.CANCELLED: "dim"}
+_COLOURS |= dict.fromkeys((State.WAITING, State.DONE_WITH_FAILED_FRAMES), "yellow")
 
 
 def service_options(function: F) -> F:

@@ -34,7 +34,7 @@ class Shade:
 def shades(run: Survey) -> list[Shade]:
     """Return the numbers by which columns can be coloured, as far as they are known."""
     every = [
-        Shade("spread", "spread", run.unit),
+        Shade("spread", "spread", run.known.unit),
         Shade("excess", "spread", "× stated error"),
         Shade("share", "accepted", "%", 100.0),
         Shade("r_squared", "R²", ""),
@@ -50,8 +50,8 @@ def page_data(run: Survey, first: int) -> dict[str, Any]:
     numbers = {"x": columns["x_ref"], "y": columns["y_ref"], "expected": columns["expected"]}
     numbers |= {shade.name: columns[shade.name] * shade.factor for shade in known}
     return {
-        "unit": run.unit,
-        "time_unit": run.time_unit,
+        "unit": run.known.unit,
+        "time_unit": run.known.time_unit,
         "first": first,
         "shades": [{"name": shade.name, "label": shade.label, "unit": shade.unit} for shade in known],
         "ids": columns["column_id"].to_numpy().tolist(),
@@ -69,7 +69,7 @@ def image_data(run: Survey) -> tuple[str, dict[str, Any]]:
     levels = grey_levels(block_means(np.where(exposed, run.summed["image"], np.nan), step))
     ny, nx = exposed.shape
     covered = [side * step for side in reversed(levels.shape)]
-    size = run.scale if run.unit == "pm" else None
+    size = run.known.scale if run.known.unit == "pm" else None
     return grey_data(levels), {"width": nx, "height": ny, "covered": covered, "pixel_size_pm": size}
 
 
@@ -140,7 +140,7 @@ def _frames(run: Survey) -> dict[str, Any]:
     """Return the curves over the frames: drift, the share of accepted fits, and the correlation with the sum."""
     curve = frame_curves(run.frames)
     data = {"time": curve["time"], "share": 100 * curve["share"]}
-    data |= {axis: run.scale * curve[f"drift_{axis}"] for axis in ("x", "y")}
+    data |= {axis: run.known.scale * curve[f"drift_{axis}"] for axis in ("x", "y")}
     if "quality" in curve:
         data["quality"] = 100 * curve["quality"]
     return {name: packed(values) for name, values in data.items()}

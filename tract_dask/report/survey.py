@@ -42,8 +42,8 @@ class Survey:
         What results.zarr says of itself; and ``movie``, what movie.zarr says.
     settings
         Those of the run; None where they cannot be read.
-    unit, scale
-        Of lengths: pm, and the size of a pixel; or px, and 1, where the size of a pixel is not known.
+    known
+        Units: lengths are in pm, or in px where the size of a pixel is not known.
     columns
         Over column_id: x_ref, y_ref, kind, the numbers of :meth:`.overview.ColumnSums.numbers`, and ``residual``, of
         the fit on the summed image, see :func:`residuals`.
@@ -66,8 +66,7 @@ class Survey:
     tracks: xr.Dataset
     about: dict[str, Any]
     settings: RunSettings | None
-    unit: str
-    scale: float
+    known: overview.Calibration
     columns: xr.Dataset
     frames: xr.Dataset
     series: xr.Dataset
@@ -85,11 +84,6 @@ class Survey:
         """Fits that were accepted."""
         return int(self.columns["accepted"].sum())
 
-    @property
-    def time_unit(self) -> str:
-        """Unit of the frames' times: s, or frames where the time of one is not known."""
-        return "s" if self.tracks.attrs.get("frame_time_s") else "frames"
-
 
 def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     """Return what a report tells of the run in ``folder``; memory does not grow with the movie.
@@ -105,8 +99,8 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
         tracks = tracks.load(scheduler="threads")
     summed = datasets.open_dataset(places.sum)
     about = metadata.attributes(places.results)
-    scale = tracks.attrs.get("pixel_size_pm")
-    measured = tracks if scale else tracks.assign_attrs(pixel_size_pm=1.0)  # lengths are then in px
+    known = overview.Calibration.of(about)
+    measured = tracks.assign_attrs(pixel_size_pm=known.scale)
     columns, frames, series = gathered(measured, None if small else results.variables(places.results))
     if places.drift.exists():
         frames["quality"] = ("frame", datasets.open_dataset(places.drift)["quality"].to_numpy())
@@ -116,8 +110,7 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
         tracks=measured,
         about=about | {"movie": metadata.attributes(places.movie)},
         settings=_settings(places.settings),
-        unit="pm" if scale else "px",
-        scale=scale or 1.0,
+        known=known,
         columns=columns,
         frames=frames,
         series=series,

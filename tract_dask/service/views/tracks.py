@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from ...analysis import motion, overview
+from ...analysis.overview import Calibration, Floats
 from ...errors import InputError, SettingsError
 from ...kernels.gaussian import parameters
 from ...settings.run import FitSettings
@@ -25,40 +25,10 @@ from ...store.run_folder import RunFolder
 from .pictures import as_json
 from .track_cache import open_tracks
 
-Floats = NDArray[np.float64]
-
 _DIGITS = 6
 _COLUMN_NUMBERS = {"sd": "spread", "sd_x": "sd_x", "sd_y": "sd_y", "stated": "expected", "accepted_share": "share"}
 _COLUMN_NUMBERS["intensity"] = "intensity"
 """Numbers of the API by the names that they have in the overview."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Calibration:
-    """What the numbers of a store mean."""
-
-    pixel_size_pm: float | None
-    frame_time_s: float | None
-    dose: float | None
-
-    @property
-    def scale(self) -> float:
-        """Lengths in :attr:`unit` for one px."""
-        return self.pixel_size_pm or 1.0
-
-    @property
-    def unit(self) -> str:
-        """Of lengths."""
-        return "pm" if self.pixel_size_pm else "px"
-
-    @property
-    def time_unit(self) -> str:
-        """Of times: frames where the time of one is not known."""
-        return "s" if self.frame_time_s else "frames"
-
-    def times(self, frames: Floats) -> Floats:
-        """Return the times of frames."""
-        return frames * (self.frame_time_s or 1.0)
 
 
 def summary(folder: Path, cache: Path, version: str) -> bytes:
@@ -107,8 +77,7 @@ def columns(folder: Path, cache: Path, version: str) -> bytes:
         "accepted": of["accepted"].tolist(),
         **{name: numbers_of(of[number]) for name, number in _COLUMN_NUMBERS.items()},
     }
-    rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
-    return as_json({"version": version, "unit": known.unit, "columns": rows})
+    return as_json({"version": version, "unit": known.unit, "columns": _rows(table)})
 
 
 def series(
@@ -204,9 +173,12 @@ def displacement(folder: Path, first: int, second: int, version: str) -> bytes:
         "y": numbers_of(tracks["y_ref"].to_numpy()),
         **{name.replace("d_", "d"): numbers_of(of) for name, of in values.items()},
     }
-    rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
-    told = {"version": version, "first": first, "second": second, "unit": known.unit, "columns": rows}
-    return as_json(told)
+    about = {"version": version, "first": first, "second": second, "unit": known.unit}
+    return as_json(about | {"columns": _rows(table)})
+
+
+def _rows(table: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
 
 def _only(path: Path, frames: tuple[int, ...]) -> xr.Dataset:
@@ -255,8 +227,7 @@ def numbers_of(values: Floats) -> list[float | None]:
 
 
 def _calibration(path: Path) -> Calibration:
-    about = metadata.attributes(path)
-    return Calibration(about.get("pixel_size_pm"), about.get("frame_time_s"), about.get("dose"))
+    return Calibration.of(metadata.attributes(path))
 
 
 def _static(path: Path) -> xr.Dataset:
