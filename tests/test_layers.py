@@ -82,6 +82,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "magnitude": [],
         "wiener": ["magnitude"],
         "binning": [],
+        "greys": [],
         "changepoints": [],
         "peaks": [],
         "rendering": [],

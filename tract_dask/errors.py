@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from enum import IntEnum
 
 _LONGEST = 200
 
@@ -20,6 +21,18 @@ def shown(value: object) -> str:
     except ValueError:  # Python writes integers of some thousand digits only
         return "a very large number"
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+class ExitCode(IntEnum):
+    """How commands, and processes of jobs, say that they ended."""
+
+    DONE = 0
+    FAILED = 1
+    BAD_INPUT = 2
+    """Also where a command is not used as it should be."""
+    BAD_FRAMES = 3
+    """Done, but for frames that could not be fitted."""
+    INTERRUPTED = 130
 
 
 class TractError(Exception):
@@ -42,7 +55,7 @@ class TractError(Exception):
     empty.tif: the movie has no frames. Check the export.
     """
 
-    exit_code = 1
+    exit_code = ExitCode.FAILED
 
     def __init__(self, what: str, where: str = "", expected: str = "", got: str = "", remedy: str = "") -> None:
         super().__init__(what, where, expected, got, remedy)  # positional, so that it pickles between workers
@@ -68,7 +81,7 @@ class TractError(Exception):
 class InputError(TractError):
     """The user's input cannot be used; nothing was started."""
 
-    exit_code = 2
+    exit_code = ExitCode.BAD_INPUT
 
 
 class SourceError(InputError):
@@ -98,7 +111,7 @@ class StoreError(TractError):
 class MissingStoreError(StoreError):
     """What is to be read is not there, is not finished, or is something else; nothing was started."""
 
-    exit_code = 2
+    exit_code = ExitCode.BAD_INPUT
 
 
 class ClusterError(TractError):

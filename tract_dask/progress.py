@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from enum import StrEnum
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self, TypeAlias
@@ -77,9 +78,21 @@ class Warned:
     message: str
 
 
+class RunState(StrEnum):
+    """How a run ended."""
+
+    PLANNED = "planned"
+    STOPPED = "stopped"
+    """After the stage that was asked for."""
+    DONE = "done"
+    DONE_WITH_BAD_FRAMES = "done_with_bad_frames"
+    INTERRUPTED = "interrupted"
+    FAILED = "failed"
+
+
 @dataclass(frozen=True)
 class RunDone:
-    """The run ended; ``state`` is done, done_with_bad_frames, stopped, interrupted or failed."""
+    """The run ended; ``state`` is a :class:`RunState`, or that of a job."""
 
     state: str
     seconds: float

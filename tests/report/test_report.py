@@ -13,13 +13,16 @@ import xarray as xr
 from conftest import Scene, store_fits
 from matplotlib import colormaps
 
+from tract_dask.analysis import overview
 from tract_dask.errors import StoreError
 from tract_dask.report import page
+from tract_dask.report import survey as survey_module
 from tract_dask.report.findings import findings
 from tract_dask.report.interactive import quantised, script_json
 from tract_dask.report.page import is_current, write_report
-from tract_dask.report.survey import column_series, survey
+from tract_dask.report.survey import gathered, survey
 from tract_dask.service.api.results import _REPORT_POLICY
+from tract_dask.service.views import tracks as tracks_of_job
 from tract_dask.settings import FitSettings, RunSettings, to_toml
 from tract_dask.store import datasets, metadata, results, schema
 from tract_dask.store.schema import Status
@@ -266,12 +269,13 @@ def test_warnings_of_the_run_itself_are_repeated(run):
     assert [finding.text for finding in findings(survey(run.write(), events))] == ["Columns.csv was edited by hand."]
 
 
-def test_series_keep_the_extremes(run):
+def test_series_keep_the_extremes(run, monkeypatch):
     run.values["fit"][17, 3, 1] += 30  # px: a single wild fit
     run.values["status"][10:20, 5] = Status.BELOW_NOISE
     tracks = results.open_results(run.write() / "results.zarr").load()
     n = tracks.sizes["column_id"]
-    series = column_series(tracks, values=12 * n * 4)
+    whole = gathered(tracks, None, values=12 * n * 4)
+    series = whole[2]
     assert series.attrs["frames"] == 10
     assert series.sizes["bin"] == 4
     own = series.sel(quantity="x").isel(column_id=3)
@@ -281,8 +285,35 @@ def test_series_keep_the_extremes(run):
     np.testing.assert_allclose(own["low"], x.reshape(4, 10).min(axis=1))
     np.testing.assert_allclose(own["error"], ERROR_PX * PIXEL_PM / np.sqrt(10))
     assert np.isnan(series["mean"].isel(bin=1, column_id=5)).all()
-    lazy = column_series(tracks.chunk(frame=7), values=12 * n * 4).compute()
-    xr.testing.assert_allclose(lazy, series)
+    monkeypatch.setattr(survey_module, "_PART_BYTES", 1)  # a bin at a time, from the store
+    in_parts = gathered(tracks, results.variables(run.folder / "results.zarr"), values=12 * n * 4)
+    for one, other in zip(in_parts, whole, strict=True):
+        xr.testing.assert_allclose(one, other)
+
+
+@pytest.mark.parametrize("has_errors", [True, False])
+def test_the_jobs_page_shows_the_same_numbers(run, has_errors):
+    _weak_column(run)
+    _bad_frame(run)
+    run.values["status"][:, 0] = Status.OUTSIDE_FRAME
+    run.values["stderr"] *= 1 if has_errors else np.nan
+    reported, cache = survey(run.write(), []), run.folder / "cache"
+    rows = json.loads(tracks_of_job.columns(run.folder, cache, "v"))["columns"]
+    names = {"sd": "spread", "stated": "expected", "accepted_share": "share"}
+    for name in ("fits", "accepted", "sd", "sd_x", "sd_y", "stated", "accepted_share", "intensity"):
+        shown = np.array([row[name] for row in rows], float)
+        np.testing.assert_allclose(shown, reported.columns[names.get(name, name)], atol=1e-6, err_msg=name)
+    frames = json.loads(tracks_of_job.frames(run.folder, cache, 7, "v"))
+    curves = overview.frame_curves(
+        {name: reported.frames[name].to_numpy() for name in overview.FRAME}, frames["frames_per_point"]
+    )
+    for shown, name in (("accepted_share", "share"), ("drift_x", "drift_x"), ("amplitude", "amplitude")):
+        np.testing.assert_allclose(np.array(frames[shown], float), curves[name], atol=1e-6)
+    own = json.loads(tracks_of_job.series(run.folder, cache, 3, (0, None), N_FRAMES, "v"))
+    for name in overview.QUANTITIES:
+        series = reported.series.sel(quantity=name, column_id=3)
+        shown = own[name if name == "intensity" else f"d{name}"]
+        np.testing.assert_allclose(np.array(shown, float), series["mean"], atol=1e-5)
 
 
 def test_packed_numbers_are_the_numbers():

@@ -14,7 +14,7 @@ from serviced import make_app
 
 from tract_dask import convert
 from tract_dask.errors import InputError
-from tract_dask.service.views.pictures import PERCENTILES, Plane, View, encode_png, grey, levels, look
+from tract_dask.service.views.pictures import PERCENTILES, Plane, View, encode_png, levels, look
 from tract_dask.settings import ConvertSettings, MetadataSettings
 from tract_dask.store import datasets
 
@@ -81,15 +81,6 @@ def test_a_box_beside_the_image_is_empty():
 
 def test_a_tall_box_is_as_high_as_a_picture_may_be():
     assert look(plane(np.ones((4, 4))), View((0, 0, 1, 5000), 2000)).shape == (2048, 1)
-
-
-def test_grey_levels_run_from_low_to_high():
-    seen = np.array([[-1, 0, 2.5, 5, 10, 99, np.nan]], np.float32)
-    np.testing.assert_array_equal(grey(seen, 0, 10), [[1, 1, 64 + 1, 128, 255, 255, 0]])
-    usual = np.arange(1001.0, dtype=np.float32)[None]
-    shown = grey(usual)  # black and white at percentiles 0.5 and 99.5
-    assert (shown[0, 5], shown[0, 500], shown[0, 995]) == (1, 128, 255)
-    assert set(grey(np.zeros((2, 2), np.float32)).ravel()) == {1}
 
 
 def test_a_png_is_read_by_others():

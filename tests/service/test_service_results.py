@@ -186,7 +186,7 @@ def test_a_long_series_is_averaged_with_the_standard_error_of_the_mean(service):
 
 def test_the_error_of_a_mean_comes_from_the_spread_where_fits_state_none():
     values = np.array([1.0, 2.0, 6.0, np.nan, 5.0, np.nan, np.nan, np.nan])
-    found = tracks._binned("x", values, np.full(8, np.nan), 4)
+    found = tracks._points("x", values, np.full(8, np.nan), 4)
     assert found["x"] == [3.0, 5.0]
     assert found["x_stderr"] == [pytest.approx(np.std([1, 2, 6], ddof=1) / np.sqrt(3), abs=1e-6), None]
 

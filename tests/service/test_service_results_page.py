@@ -144,6 +144,25 @@ def test_what_is_done_is_shown_and_the_rest_comes_by_itself(page, job):
     assert page.locator("#report").is_hidden()
 
 
+def test_medians_of_an_even_number_of_columns_are_those_of_the_report(chromium, job):
+    page, rows = chromium.new_page(), []
+
+    def without_the_first(route):
+        answer = route.fetch()
+        found = answer.json()
+        rows[:] = found["columns"][1:]
+        route.fulfill(response=answer, json=found | {"columns": rows})
+
+    page.route("**/results/columns*", without_the_first)
+    page.goto(job[0])
+    page.wait_for_selector("#chosen li")
+    known = np.array([row["sd"] for row in rows if row["sd"] is not None])
+    assert len(known) == 4
+    shown = re.search(r"sd, median([\d.]+) pm", page.locator("#figures").text_content())
+    assert float(shown[1]) == pytest.approx(np.median(known), rel=6e-3)
+    page.close()
+
+
 def test_downloads_are_offered(page, job, tmp_path):
     page.click("#downloads summary")
     with page.expect_download() as download:

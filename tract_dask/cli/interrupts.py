@@ -13,12 +13,12 @@ from time import monotonic
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from ..errors import ExitCode
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 SENTENCE = "Interrupted: what is done is kept, and the same command goes on from there."
-
-CODE = 130
 
 _SOON_S = 20.0
 _SHOW_CURSOR = "\x1b[?25h"
@@ -33,7 +33,7 @@ def end_at_once(number: int = 0, frame: FrameType | None = None) -> None:
                 child.kill()
     cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
     os.write(2, f"{cursor}\n{SENTENCE}\n".encode())
-    os._exit(CODE)
+    os._exit(ExitCode.INTERRUPTED)
 
 
 class Interrupts:

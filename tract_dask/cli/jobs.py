@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
-from ..errors import InputError
+from ..errors import ExitCode, InputError
 from ..progress import Event, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
+from ..service.jobs.states import State
 from ..settings.run import RunSettings
 from .options import setting_options
 from .show import PATH, common_options, show
@@ -24,17 +25,15 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-STATES = ("queued", "running", "waiting_for_columns", "done", "done_with_failed_frames", "failed", "cancelled")
-
 TOKEN_VARIABLE = "TRACT_DASK_TOKEN"
 
-_CODES = {"failed": 1, "cancelled": 1, "done_with_failed_frames": 3}
+_CODES = dict.fromkeys((State.FAILED, State.CANCELLED), ExitCode.FAILED)
+_CODES[State.DONE_WITH_FAILED_FRAMES] = ExitCode.BAD_FRAMES
 """Exit codes of the jobs that one watches to their end, as those of a run."""
 
-_INTERRUPTED = 130
 _FILE_WIDTH = 250
-_COLOURS = {"running": "cyan", "waiting_for_columns": "yellow", "done": "green", "failed": "red", "cancelled": "dim"}
-_COLOURS["done_with_failed_frames"] = "yellow"
+_COLOURS = {State.RUNNING: "cyan", State.DONE: "green", State.FAILED: "red", State.CANCELLED: "dim"}
+_COLOURS |= dict.fromkeys((State.WAITING, State.DONE_WITH_FAILED_FRAMES), "yellow")
 
 
 def service_options(function: F) -> F:
@@ -89,7 +88,9 @@ def submit(
 
 
 @click.command()
-@click.option("--state", "states", multiple=True, type=click.Choice(STATES), help="Only those; may be repeated.")
+@click.option(
+    "--state", "states", multiple=True, type=click.Choice([*map(str, State)]), help="Only those; may be repeated."
+)
 @click.option("--owner", default="", metavar="NAME", help="Only this owner's.")
 @click.option("--text", default="", metavar="TEXT", help="Only those with this in label, source, owner or id.")
 @click.option("--limit", default=20, show_default=True, type=click.IntRange(1), help="Most jobs, the newest first.")
@@ -147,7 +148,7 @@ class Translation:
             yield RunStarted(job.source, job.output)
         yield from self._progressed(job.progress)
         if job.is_at_rest:
-            yield RunDone("done" if job.state == "done" else str(job.state), _seconds(job), _farewell(job))
+            yield RunDone(str(job.state), _seconds(job), _farewell(job))
         elif self._state not in ("", job.state) and job.reason:
             yield Warned(f"{job.state}: {job.reason}")
         self._state = str(job.state)
@@ -183,7 +184,7 @@ def _watch(service: ServiceClient, job_id: str, *, as_json: bool) -> None:
                     terminal(shown)
     except KeyboardInterrupt:
         click.echo(f"The job goes on. Watch it again with: tract-dask watch {job_id}", err=True)
-        click.get_current_context().exit(_INTERRUPTED)
+        click.get_current_context().exit(ExitCode.INTERRUPTED)
     if job is None or not job.is_at_rest:
         raise InputError("the job was deleted", job_id)
     _show_job(job, service, as_json=as_json)
@@ -198,7 +199,7 @@ def _show_job(job: ServiceJob, service: ServiceClient, *, as_json: bool) -> None
         if job.outcome.get(name) is not None:
             rows[name] = f"{job.outcome[name]:,}"
     page = f"{service.url}/jobs/{job.id}"
-    rows |= {"output": job.output, "page": f"{page}/columns" if job.state == "waiting_for_columns" else page}
+    rows |= {"output": job.output, "page": f"{page}/columns" if job.state == State.WAITING else page}
     show(asdict(job) if as_json else rows, as_json=as_json)
 
 
@@ -219,7 +220,7 @@ def _print_table(found: list[ServiceJob]) -> None:
         right = name in ("", "frames/s", "left")
         table.add_column(name, justify="right" if right else "left", no_wrap=True, min_width=widths.get(name))
     for job in found:
-        running, progress = job.state == "running", job.progress
+        running, progress = job.state == State.RUNNING, job.progress
         share = float(progress.get("fraction") or 0.0)
         rate, left = progress.get("frames_per_s"), progress.get("seconds_left")
         table.add_row(
@@ -240,10 +241,10 @@ def _print_table(found: list[ServiceJob]) -> None:
 def _farewell(job: ServiceJob) -> str:
     """Return what is said at the end, beside what every end of a run says."""
     said = {
-        "waiting_for_columns": "it waits for its columns to be edited",
-        "done_with_failed_frames": "done, with frames that could not be fitted",
-        "failed": f"failed: {job.reason}",
-        "cancelled": job.reason or "cancelled",
+        State.WAITING: "it waits for its columns to be edited",
+        State.DONE_WITH_FAILED_FRAMES: "done, with frames that could not be fitted",
+        State.FAILED: f"failed: {job.reason}",
+        State.CANCELLED: job.reason or "cancelled",
     }
     return said.get(job.state, "")
 

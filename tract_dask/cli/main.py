@@ -13,14 +13,14 @@ from typing import Any, NoReturn, TypeVar
 
 import click
 
-from ..errors import TractError, check_system
+from ..errors import ExitCode, TractError, check_system
 from . import interrupts
 from .jobs import cancel, jobs, submit, watch
 from .options import Command
 from .results import compare_filters, export, figures, report, verify
 from .run import columns, convert, demo, drift, fit, inspect, run
 from .serve import certs, serve, token
-from .show import DEBUG, FAILED
+from .show import DEBUG
 from .simulate import simulate
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -43,7 +43,7 @@ class Group(click.Group):
                 return super().invoke(ctx)
         except KeyboardInterrupt:
             click.echo(interrupts.SENTENCE, err=True)
-            ctx.exit(interrupts.CODE)
+            ctx.exit(ExitCode.INTERRUPTED)
         except (click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except TractError as error:
@@ -51,7 +51,7 @@ class Group(click.Group):
         except Exception as error:  # noqa: BLE001  the last resort of the command line, which has to explain itself
             said = str(error).rstrip(".")
             text = f"Error: unexpected {type(error).__name__}: {said}. Say --debug to see where; what is done is kept."
-            self._explain(ctx, text, FAILED)
+            self._explain(ctx, text, ExitCode.FAILED)
 
     def _explain(self, ctx: click.Context, text: str, code: int) -> None:
         if ctx.meta.get(DEBUG):

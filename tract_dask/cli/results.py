@@ -8,10 +8,11 @@ from typing import Any
 
 import click
 
+from ..errors import ExitCode
 from ..settings.run import RunSettings
 from .options import Command, numbers, setting_options
 from .run import get_ready
-from .show import FAILED, PATH, common_options, progress, show
+from .show import PATH, common_options, progress, show
 
 
 @click.command(cls=Command)
@@ -34,7 +35,7 @@ def verify(path: Path, *, repair: bool, as_json: bool) -> None:
     else:
         click.echo(found.text())
     if not found.sound:
-        click.get_current_context().exit(FAILED)
+        click.get_current_context().exit(ExitCode.FAILED)
 
 
 @click.command("compare-filters", cls=Command)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..progress import STAGES
+from ..progress import STAGES, RunState
 from ..settings.run import RunSettings
 from .options import Command, setting_options
 from .show import PATH, common_options, show
@@ -185,7 +185,7 @@ def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:
     """Print what a run did, or what it would do, and end with the exit code for it."""
     if as_json:
         click.echo(json.dumps(outcome.to_record()))
-    elif outcome.state == "planned":
+    elif outcome.state == RunState.PLANNED:
         show(_plan_rows(outcome.plan), as_json=False)
     else:
         share = f" ({outcome.accepted / outcome.fits:.1%})" if outcome.fits else ""
@@ -198,7 +198,7 @@ def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:
         rows |= {"frames not fitted": outcome.bad_frames} if outcome.bad_frames else {}
         written = [path for path in outcome.outputs.paths().values() if Path(path).exists()]
         show(rows | {"wrote": written}, as_json=False)
-    if outcome.state == "planned":
+    if outcome.state == RunState.PLANNED:
         outcome.plan.check()
     exit_for(outcome.bad_frames)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from ..errors import ExitCode
 from .options import Command
 
 if TYPE_CHECKING:
@@ -61,9 +62,6 @@ def show(found: dict[str, Any], *, as_json: bool) -> None:
             click.echo(f"{name if k == 0 else '':<{width}}  {'-' if line is None else line}")
 
 
-FAILED, BAD_FRAMES = 1, 3
-"""Exit codes beside 0, 2 for usage or bad input, and that of an interrupt."""
-
 overwrite_option = click.option("--overwrite", is_flag=True, help="Begin anew, whatever is there.")
 
 
@@ -80,4 +78,4 @@ def progress() -> Iterator[Sink]:
 def exit_for(bad_frames: int) -> None:
     """End with the exit code for frames that could not be fitted, if there are any."""
     if bad_frames:
-        click.get_current_context().exit(BAD_FRAMES)
+        click.get_current_context().exit(ExitCode.BAD_FRAMES)

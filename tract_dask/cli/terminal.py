@@ -15,6 +15,7 @@ from ..progress import (
     Event,
     RunDone,
     RunStarted,
+    RunState,
     ShardDone,
     StageDone,
     StageMeter,
@@ -27,10 +28,10 @@ from ..progress import (
 
 _PLAIN_INTERVAL_S = 10.0
 
-_ENDS = {
-    "done": "done",
-    "done_with_bad_frames": "done, with frames that could not be fitted",
-    "stopped": "stopped as asked: the same command without --until goes on from there",
+_ENDS: dict[str, str] = {
+    RunState.DONE: "done",
+    RunState.DONE_WITH_BAD_FRAMES: "done, with frames that could not be fitted",
+    RunState.STOPPED: "stopped as asked: the same command without --until goes on from there",
 }
 
 
@@ -156,7 +157,7 @@ class Terminal:
             self._live.refresh()
             self._live.stop()
         message = event.message or _ENDS.get(event.state, event.state)
-        styles = {"done": "green", "failed": "red"}
+        styles: dict[str, str] = {RunState.DONE: "green", RunState.FAILED: "red"}
         self._say(f"{message} ({clock(event.seconds)})", styles.get(event.state, "yellow"))
 
     def _plain(self, text: str) -> None:

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingsError
 from ..kernels.gaussian.intensity import Floats
+from ..kernels.greys import block_means, contrast
 from ..store import schema
 from ..store.columns import positions
 
@@ -46,8 +47,6 @@ FEW = 80
 
 _PNG = {"compress_level": 1}
 """Noise does not compress: higher levels take three times as long for the same size."""
-_GREY = 0.5, 99.7
-"""Percentiles of the pixels that become black and white."""
 _HIGHEST = 97.0
 """Percentile of the values that ends a colour bar, so that one restless column does not flatten all others."""
 _MOST_POINTS = 800
@@ -117,10 +116,8 @@ def show_pixels(axes: Axes, image: NDArray[Any], origin: tuple[float, float], in
         The longer side of the image as drawn.
     """
     (ny, nx), (left, top) = image.shape, (origin[0] - 0.5, origin[1] - 0.5)
-    known = np.isfinite(image)
     step = max(1, round(max(ny, nx) / (inches * dpi)))
-    count = _block_sums(known, step)
-    shown = np.where(count > 0, _block_sums(np.where(known, image, 0.0), step) / np.maximum(count, 1), np.nan)
+    shown = block_means(image, step)
     show_grey(axes, shown, (left, left + step * shown.shape[1], top + step * shown.shape[0], top))
     axes.set(xlim=(left, left + nx), ylim=(top + ny, top))
 
@@ -133,21 +130,11 @@ def show_grey(axes: Axes, image: NDArray[Any], extent: tuple[float, float, float
     extent
         Left, right, bottom, top edge in px of the summed image.
     """
-    known = image[np.isfinite(image)]
-    low, high = np.percentile(known, _GREY) if known.size else (0.0, 1.0)
+    low, high = contrast(image)
     grey = mpl.colormaps["gray"].with_extremes(bad="#c8d0d8")
     axes.imshow(image, cmap=grey, vmin=low, vmax=high, extent=extent)
     axes.set(xlim=extent[:2], ylim=extent[2:])
     axes.set_axis_off()
-
-
-def _block_sums(image: NDArray[Any], step: int) -> Floats:
-    """Return the sums of blocks of ``step`` x ``step`` pixels; those at the right and the bottom may be smaller."""
-    ny, nx = (-(-size // step) for size in image.shape)
-    whole = np.zeros((ny * step, nx * step), image.dtype)
-    whole[: image.shape[0], : image.shape[1]] = image
-    rows = whole.reshape(ny, step, nx * step).sum(axis=1, dtype=np.float64)
-    return np.asarray(rows.reshape(ny, nx, step).sum(axis=2))
 
 
 def scale_bar(axes: Axes, pixel_size_pm: float | None) -> None:

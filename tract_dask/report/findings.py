@@ -92,7 +92,7 @@ def count(number: int, what: str) -> str:
 
 def _calibration(run: Survey) -> Iterator[Finding]:
     known = run.tracks.attrs
-    if run.unit == "px":
+    if run.known.unit == "px":
         text = "The movie does not say how large a pixel is, so all lengths here are in pixels."
         yield Finding(
             "pixel_size", "The pixel size is not known", text, "Run the same command again with --pixel-size-pm."

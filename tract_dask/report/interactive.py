@@ -11,8 +11,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from .pictures import grey_data, grey_levels
-from .survey import QUANTITIES, Survey, frame_curve
+from ..analysis.overview import QUANTITIES
+from ..kernels.greys import block_means, grey_levels
+from .pictures import grey_data
+from .survey import Survey, frame_curves
 
 _IMAGE_PX = 900
 _MISSING = -32768
@@ -32,7 +34,7 @@ class Shade:
 def shades(run: Survey) -> list[Shade]:
     """Return the numbers by which columns can be coloured, as far as they are known."""
     every = [
-        Shade("spread", "spread", run.unit),
+        Shade("spread", "spread", run.known.unit),
         Shade("excess", "spread", "× stated error"),
         Shade("share", "accepted", "%", 100.0),
         Shade("r_squared", "R²", ""),
@@ -48,8 +50,8 @@ def page_data(run: Survey, first: int) -> dict[str, Any]:
     numbers = {"x": columns["x_ref"], "y": columns["y_ref"], "expected": columns["expected"]}
     numbers |= {shade.name: columns[shade.name] * shade.factor for shade in known}
     return {
-        "unit": run.unit,
-        "time_unit": run.time_unit,
+        "unit": run.known.unit,
+        "time_unit": run.known.time_unit,
         "first": first,
         "shades": [{"name": shade.name, "label": shade.label, "unit": shade.unit} for shade in known],
         "ids": columns["column_id"].to_numpy().tolist(),
@@ -63,11 +65,11 @@ def page_data(run: Survey, first: int) -> dict[str, Any]:
 def image_data(run: Survey) -> tuple[str, dict[str, Any]]:
     """Return the summed image as a data URL; and its size, how many px the picture covers, the size of a pixel."""
     exposed = (run.summed["exposure"] > 0).to_numpy()
-    levels = grey_levels(run.summed["image"].to_numpy(), exposed, _IMAGE_PX)
     step = -(-max(exposed.shape) // _IMAGE_PX)
+    levels = grey_levels(block_means(np.where(exposed, run.summed["image"], np.nan), step))
     ny, nx = exposed.shape
     covered = [side * step for side in reversed(levels.shape)]
-    size = run.scale if run.unit == "pm" else None
+    size = run.known.scale if run.known.unit == "pm" else None
     return grey_data(levels), {"width": nx, "height": ny, "covered": covered, "pixel_size_pm": size}
 
 
@@ -136,9 +138,9 @@ def quantised(values: NDArray[np.float64]) -> tuple[NDArray[np.int16], NDArray[n
 
 def _frames(run: Survey) -> dict[str, Any]:
     """Return the curves over the frames: drift, the share of accepted fits, and the correlation with the sum."""
-    curve = frame_curve(run.frames)
+    curve = frame_curves(run.frames)
     data = {"time": curve["time"], "share": 100 * curve["share"]}
-    data |= {axis: run.scale * curve["drift"].sel(axis=axis) for axis in ("x", "y")}
+    data |= {axis: run.known.scale * curve[f"drift_{axis}"] for axis in ("x", "y")}
     if "quality" in curve:
         data["quality"] = 100 * curve["quality"]
-    return {name: packed(values.to_numpy().astype(float)) for name, values in data.items()}
+    return {name: packed(values) for name, values in data.items()}

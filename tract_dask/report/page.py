@@ -148,7 +148,7 @@ def render(run: Survey, key: str = "", *, figures: bool = True) -> str:
         residual_limit=RESIDUAL,
         windows=_windows(run),
         pictures=list(_pictures(run)) if figures else [],
-        unit=run.unit,
+        unit=run.known.unit,
         measured=measured(run),
         changed=[row for group in settings_rows(run.settings).values() for row in group if row["changed"]],
         settings=settings_rows(run.settings),
@@ -164,9 +164,9 @@ def _source(run: Survey) -> str:
 
 def cards(run: Survey) -> list[tuple[str, str, str]]:
     """Return the numbers that stand on top: a name, a value, and what belongs to it."""
-    columns = run.columns
+    columns, unit = run.columns, run.known.unit
     spread, expected = _median(columns["spread"]), _median(columns["expected"])
-    drift = run.scale * np.ptp(run.frames["drift"].to_numpy(), axis=0)
+    drift = run.known.scale * np.ptp(run.frames["drift"].to_numpy(), axis=0)
     n_frames = run.frames.sizes["frame"]
     frame_time = run.tracks.attrs.get("frame_time_s")
     lasting = f"{n_frames * frame_time:.4g} s" if frame_time else "frame time not known"
@@ -175,9 +175,9 @@ def cards(run: Survey) -> list[tuple[str, str, str]]:
         ("Frames", f"{n_frames:,}", lasting),
         ("Columns", f"{columns.sizes['column_id']:,}", f"{fitted:,} of them fitted"),
         ("Fits accepted", _percent(run.accepted, run.fits), f"{run.accepted:,} of {run.fits:,}"),
-        ("Spread", _number(spread, run.unit), f"median per axis; stated error {_number(expected, run.unit)}"),
+        ("Spread", _number(spread, unit), f"median per axis; stated error {_number(expected, unit)}"),
         ("R²", _number(_median(columns["r_squared"])), "median of the columns' means"),
-        ("Drift", _lengths(drift[::-1], run.unit), "range along x and y"),
+        ("Drift", _lengths(drift[::-1], unit), "range along x and y"),
     ]
 
 
@@ -191,9 +191,9 @@ def quality(run: Survey) -> list[str]:
     ]
     if np.isfinite(columns["spread"]).any():
         spread, expected = _median(columns["spread"]), _median(columns["expected"])
-        error = f"an error of {_number(expected, run.unit)}" if np.isfinite(expected) else "no error"
+        error = f"an error of {_number(expected, run.known.unit)}" if np.isfinite(expected) else "no error"
         said.append(
-            f"A column spreads by {_number(spread, run.unit)} per axis (median over the columns); the fits state "
+            f"A column spreads by {_number(spread, run.known.unit)} per axis (median over the columns); the fits state "
             f"{error}."
         )
     if np.isfinite(run.factor) and n_frames > 2:
@@ -231,7 +231,7 @@ def first_column(run: Survey) -> int:
 
 def worst_columns(run: Survey) -> list[dict[str, Any]]:
     """Return the columns that are worth a look: few accepted fits, a large residual, a spread beyond the errors."""
-    columns = run.columns.drop_vars(["parameter", "unit", "fit_ref"], errors="ignore")
+    columns = run.columns
     rank = {
         "few accepted fits": -np.nan_to_num(columns["share"].to_numpy(), nan=0.0),
         "large residual": np.nan_to_num(columns["residual"].to_numpy(), nan=-np.inf),
@@ -253,8 +253,8 @@ def worst_columns(run: Survey) -> list[dict[str, Any]]:
                 "why": ", ".join(why),
                 "share": _percent(int(own["accepted"]), int(own["fits"])),
                 "residual": f"{float(own['residual']):.1%}" if np.isfinite(own["residual"]) else "-",
-                "spread": _number(float(own["spread"]), run.unit),
-                "expected": _number(float(own["expected"]), run.unit),
+                "spread": _number(float(own["spread"]), run.known.unit),
+                "expected": _number(float(own["expected"]), run.known.unit),
                 "r_squared": _number(float(own["r_squared"])),
             }
         )
@@ -271,7 +271,7 @@ def _windows(run: Survey) -> list[dict[str, Any]]:
 
 def _pictures(run: Survey) -> Iterator[Picture]:
     """Yield the figures that the tracks allow."""
-    if run.unit == "px":
+    if run.known.unit == "px":
         return
     tracks, summed = run.tracks, run.summed
     makers: list[tuple[str, str, Callable[[], Figure]]] = []
@@ -303,9 +303,9 @@ def measured(run: Survey) -> list[tuple[str, str]]:
         "Movie": _source(run),
         "Format": movie.get("source_format"),
         "Frames": f"{shape[0]:,} of {shape[2]:,} × {shape[1]:,} px ({movie.get('dtype', 'dtype not known')})",
-        "Size of a pixel": f"{known['pixel_size_pm']:g} pm" if run.unit == "pm" else "not known",
-        "Field of view": f"{shape[2] * run.scale / 1000:.3g} × {shape[1] * run.scale / 1000:.3g} nm"
-        if run.unit == "pm"
+        "Size of a pixel": f"{known['pixel_size_pm']:g} pm" if run.known.unit == "pm" else "not known",
+        "Field of view": f"{shape[2] * run.known.scale / 1000:.3g} × {shape[1] * run.known.scale / 1000:.3g} nm"
+        if run.known.unit == "pm"
         else None,
         "Time of a frame": f"{known['frame_time_s']:g} s" if known.get("frame_time_s") else "not known",
         "Dose of a frame": f"{known['dose']:g} e/Å²" if known.get("dose") else "not known",

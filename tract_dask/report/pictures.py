@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from base64 import b64encode
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -54,19 +53,3 @@ def windows_data(shown: NDArray[np.float64]) -> str:
 
 def _url(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{b64encode(data).decode('ascii')}"
-
-
-def grey_levels(image: NDArray[Any], exposed: NDArray[np.bool_], longest: int) -> NDArray[np.uint8]:
-    """Return an image (y, x) as grey levels 1 to 255, binned to ``longest`` pixels at most; 0: not exposed."""
-    step = max(1, -(-max(image.shape) // longest))
-    ny, nx = (-(-size // step) * step for size in image.shape)
-    padding = ((0, ny - image.shape[0]), (0, nx - image.shape[1]))
-    blocks = [
-        np.pad(part, padding).reshape(ny // step, step, nx // step, step).sum(axis=(1, 3))
-        for part in (np.where(exposed, image, 0.0), exposed.astype(float))
-    ]
-    mean = np.divide(blocks[0], blocks[1], out=np.full_like(blocks[0], np.nan), where=blocks[1] > 0)
-    known = mean[np.isfinite(mean)]
-    low, high = np.percentile(known, [0.5, 99.7]) if known.size else (0.0, 1.0)
-    level = 1 + 254 * np.clip((mean - low) / ((high - low) or 1.0), 0, 1)
-    return np.where(np.isfinite(mean), np.nan_to_num(level), 0).astype(np.uint8)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import dask
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from ..analysis import motion
+from ..analysis import overview
 from ..analysis.jumps import noise_factor
+from ..analysis.overview import Floats
 from ..errors import SettingsError
 from ..kernels.blur import blur
 from ..kernels.gaussian.model import evaluate
@@ -21,13 +21,13 @@ from ..settings.run import RunSettings
 from ..settings.toml import load
 from ..store import datasets, metadata, results, schema
 from ..store.run_folder import RunFolder
-from ..store.schema import Status
 
 VALUES = 1_600_000
 """Numbers that the series of all columns together may have: 4 MB of the page."""
-QUANTITIES = ("x", "y", "intensity")
 _IN_MEMORY = 256 << 20
-"""Tracks of no more bytes are read once; larger ones are gone through chunk by chunk, several times."""
+"""Tracks of no more bytes are read once; larger ones are gone through part by part, more than once."""
+_PART_BYTES = 16 << 20
+"""So many bytes of fits are looked at together, or those of a bin of frames."""
 _FRAMES = 2000
 """Points that a curve over the frames may have."""
 
@@ -42,18 +42,18 @@ class Survey:
         What results.zarr says of itself; and ``movie``, what movie.zarr says.
     settings
         Those of the run; None where they cannot be read.
-    unit, scale
-        Of lengths: pm, and the size of a pixel; or px, and 1, where the size of a pixel is not known.
+    known
+        Units: lengths are in pm, or in px where the size of a pixel is not known.
     columns
-        Over column_id: x_ref, y_ref, kind, ``outside``, ``fits``, ``accepted``, ``share`` and the numbers of fits with
-        each flag; over accepted fits the mean ``r_squared`` and ``intensity``, ``spread`` (the sd per axis),
-        ``expected`` (the root mean square of the stated errors) and ``excess``, the one over the other; ``residual``,
-        of the fit on the summed image, see :func:`residuals`.
+        Over column_id: x_ref, y_ref, kind, the numbers of :meth:`.overview.ColumnSums.numbers`, and ``residual``, of
+        the fit on the summed image, see :func:`residuals`.
     frames
-        Over frame: time, drift, drift_measured (frame, axis), noise, ``share`` of accepted fits, ``bad``, and
-        ``quality`` of the drift where it was measured.
+        Over frame: time, drift, drift_measured (frame, axis), the numbers of :meth:`.overview.Part.frames`, ``share``
+        of accepted fits, and ``quality`` of the drift where it was measured.
     series
-        See :func:`column_series`.
+        Place and intensity of every column in time, averaged over frames until they fit on a page, see
+        :func:`.overview.binned`: over (bin, quantity, column_id), where quantity is x and y, measured from the place in
+        the summed image, and intensity (counts); ``time`` (bin). Attribute ``frames``: how many a bin has.
     factor
         Median over columns of :func:`tract_dask.analysis.jumps.noise_factor`; NaN where no error is known.
     summed
@@ -66,8 +66,7 @@ class Survey:
     tracks: xr.Dataset
     about: dict[str, Any]
     settings: RunSettings | None
-    unit: str
-    scale: float
+    known: overview.Calibration
     columns: xr.Dataset
     frames: xr.Dataset
     series: xr.Dataset
@@ -85,11 +84,6 @@ class Survey:
         """Fits that were accepted."""
         return int(self.columns["accepted"].sum())
 
-    @property
-    def time_unit(self) -> str:
-        """Unit of the frames' times: s, or frames where the time of one is not known."""
-        return "s" if self.tracks.attrs.get("frame_time_s") else "frames"
-
 
 def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     """Return what a report tells of the run in ``folder``; memory does not grow with the movie.
@@ -101,14 +95,13 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     """
     places = RunFolder(folder)
     tracks = results.open_results(places.results)
-    if tracks.nbytes <= _IN_MEMORY:
+    if small := tracks.nbytes <= _IN_MEMORY:
         tracks = tracks.load(scheduler="threads")
     summed = datasets.open_dataset(places.sum)
     about = metadata.attributes(places.results)
-    scale = tracks.attrs.get("pixel_size_pm")
-    measured = tracks if scale else tracks.assign_attrs(pixel_size_pm=1.0)  # lengths are then in px
-    lazy = column_numbers(measured), frame_numbers(tracks), column_series(measured)
-    columns, frames, series = dask.compute(*lazy, scheduler="threads", optimize_graph=False)  # else dask loses keys
+    known = overview.Calibration.of(about)
+    measured = tracks.assign_attrs(pixel_size_pm=known.scale)
+    columns, frames, series = gathered(measured, None if small else results.variables(places.results))
     if places.drift.exists():
         frames["quality"] = ("frame", datasets.open_dataset(places.drift)["quality"].to_numpy())
     columns["residual"] = ("column_id", residuals(tracks, summed)[0])
@@ -117,8 +110,7 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
         tracks=measured,
         about=about | {"movie": metadata.attributes(places.movie)},
         settings=_settings(places.settings),
-        unit="pm" if scale else "px",
-        scale=scale or 1.0,
+        known=known,
         columns=columns,
         frames=frames,
         series=series,
@@ -128,95 +120,57 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     )
 
 
-def column_numbers(tracks: xr.Dataset) -> xr.Dataset:
-    """Return the numbers over column_id of :class:`Survey`, lazily."""
-    trusted = results.accepted(tracks)
-    fitted, good = _fitted(tracks), _good(tracks)
-    spread = motion.spread(tracks)["sd"]
-    expected = ((motion.standard_errors(tracks) ** 2).mean("axis", skipna=False)).mean("frame") ** 0.5
-    fits, accepted = fitted.sum("frame"), good.sum("frame")
-    flags = {
-        str(flag.name).lower(): (fitted & ((tracks["status"] & np.uint8(flag)) > 0)).sum("frame")
-        for flag in (Status.BELOW_NOISE, Status.NOT_CONVERGED, Status.AT_BOUND, Status.SHAPE_AT_BOUND)
-    }
-    found = xr.Dataset(
-        {
-            "outside": ((tracks["status"] & np.uint8(Status.OUTSIDE_FRAME)) > 0).sum("frame"),
-            "fits": fits,
-            "accepted": accepted,
-            "share": accepted / fits.where(fits > 0),
-            "r_squared": tracks["r_squared"].where(good).mean("frame").astype(float),
-            "intensity": trusted["intensity"].mean("frame"),
-            "spread": spread,
-            "expected": expected,
-            "excess": spread / expected.where(expected > 0),
-            **flags,
-        }
-    )
-    return found.assign({name: tracks[name] for name in ("x_ref", "y_ref", "kind", "status_ref", "fit_ref")})
-
-
-def frame_numbers(tracks: xr.Dataset) -> xr.Dataset:
-    """Return the numbers over frame of :class:`Survey`, lazily."""
-    fits = _fitted(tracks).sum("column_id")
-    found = tracks[["time", "drift", "drift_measured", "noise"]]
-    return found.assign(
-        share=_good(tracks).sum("column_id") / fits.where(fits > 0),
-        bad=((tracks["status"] & np.uint8(Status.BAD_FRAME)) > 0).any("column_id"),
-    )
-
-
-def column_series(tracks: xr.Dataset, values: int = VALUES) -> xr.Dataset:
-    """Return place and intensity of every column in time, averaged over frames until they fit on a page, lazily.
+def gathered(tracks: xr.Dataset, opened: Callable[[str], Any] | None, values: int = VALUES) -> tuple[xr.Dataset, ...]:
+    """Return ``columns``, ``frames`` and ``series`` of :class:`Survey`.
 
     Parameters
     ----------
     tracks
-        Results; only accepted fits count.
+        Their lengths are in units of ``pixel_size_pm``.
+    opened
+        Returns a variable of them, which is read part by part; None: they are in memory.
     values
         Numbers that all series together may have.
-
-    Returns
-    -------
-    Dataset
-        Over (bin, column_id, quantity), where quantity is x and y, measured from the place in the summed image (pm),
-        and intensity (counts): ``mean`` over the frames of the bin, its standard error ``error`` as the fits state it;
-        ``low`` and ``high``, the extremes of single frames, so that no jump and no outlier is averaged away; ``time``
-        (bin), the middle of the bin. NaN where no fit is accepted. Attribute ``frames``: how many a bin has.
     """
-    trusted = results.accepted(tracks)
-    place = motion.positions(tracks) - motion.reference_positions(tracks)
-    value = {
-        "x": place.sel(axis="x", drop=True),
-        "y": place.sel(axis="y", drop=True),
-        "intensity": trusted["intensity"],
-    }
-    stated = motion.standard_errors(tracks)
-    error = {"x": stated.sel(axis="x", drop=True), "y": stated.sel(axis="y", drop=True)}
-    error["intensity"] = trusted["intensity_stderr"]
-    n_frames, n_columns = tracks.sizes["frame"], tracks.sizes["column_id"]
-    frames = _frames_a_bin(n_frames, n_columns, values)
-    parts = []
-    for name in QUANTITIES:
-        binned, variance = _binned(value[name], frames), _binned(error[name] ** 2, frames)
-        counted = binned.count()
-        mean = {"mean": binned.mean(), "low": binned.min(), "high": binned.max()}
-        parts.append(xr.Dataset(mean | {"error": variance.mean() ** 0.5 / counted.where(counted > 0) ** 0.5}))
-    series = xr.concat(parts, dim="quantity").assign_coords(quantity=schema.texts(QUANTITIES))
-    series = series.rename(frame="bin").drop_vars(["bin", "parameter", "unit"], errors="ignore")
-    series["time"] = _binned(tracks["time"], frames).mean().rename(frame="bin").drop_vars("bin", errors="ignore")
-    return series.transpose("bin", "column_id", "quantity").assign_attrs(frames=frames)
+    n_frames, n_columns, scale = tracks.sizes["frame"], tracks.sizes["column_id"], tracks.attrs["pixel_size_pm"]
+    step = _frames_a_bin(n_frames, n_columns, values)
+    origin = np.stack([tracks["x_ref"], tracks["y_ref"], np.zeros(n_columns)])
+    units = np.array([scale, scale, 1.0])[:, None]
+    sums, by_frame, binned = overview.ColumnSums.nothing(n_columns), [], []
+    per_part = max(1, _PART_BYTES // (8 * 7 * max(1, n_columns) * step)) * step
+    for start in range(0, n_frames, per_part):
+        part = overview.Part(opened or (lambda name: tracks[name].to_numpy()), start, min(start + per_part, n_frames))
+        sums += part.columns()
+        by_frame.append(part.frames())
+        places, errors = np.split(part.series.transpose(1, 0, 2), 2, axis=1)
+        binned.append(overview.binned((places - origin) * units, errors * units, step))
+    numbers = {name: ("column_id", number) for name, number in sums.numbers(scale).items()}
+    columns = tracks[["x_ref", "y_ref", "kind"]].assign(numbers)
+    return columns, _frames(tracks, np.concatenate(by_frame, axis=1)), _series(tracks, binned, step)
 
 
-def frame_curve(frames: xr.Dataset) -> xr.Dataset:
+def _frames(tracks: xr.Dataset, numbers: Floats) -> xr.Dataset:
+    of = dict(zip(overview.FRAME, numbers, strict=True))
+    of |= {"bad": of["bad"] > 0, "share": of["accepted"] / np.where(of["fits"] > 0, of["fits"], np.nan)}
+    known = tracks[["time", "drift", "drift_measured"]].compute(scheduler="threads")
+    return known.assign({name: ("frame", number) for name, number in of.items()})
+
+
+def _series(tracks: xr.Dataset, binned: list[dict[str, Floats]], step: int) -> xr.Dataset:
+    dims = "bin", "quantity", "column_id"
+    found = {name: (dims, np.concatenate([part[name] for part in binned])) for name in binned[0]}
+    coordinates = {"quantity": schema.texts(overview.QUANTITIES), "column_id": tracks["column_id"]}
+    time = overview.binned_mean(tracks["time"].to_numpy(), step)
+    return xr.Dataset(found, coordinates, {"frames": step}).assign(time=("bin", time))
+
+
+def frame_curves(frames: xr.Dataset) -> dict[str, Floats]:
     """Return the numbers over frame, averaged until a curve has no more points than a screen can show."""
-    known = frames[
-        [name for name in ("time", "drift", "drift_measured", "noise", "share", "quality") if name in frames]
-    ]
-    return known.coarsen(frame=-(-frames.sizes["frame"] // _FRAMES), boundary="pad").mean()
+    known = {str(name): values.to_numpy() for name, values in frames.items() if values.dims == ("frame",)}
+    return overview.frame_curves(known, -(-frames.sizes["frame"] // _FRAMES))
 
 
-def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[Floats, Floats]:
     """Return what the fits on the summed image leave.
 
     Returns
@@ -247,15 +201,6 @@ def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[NDArray[np.float6
     return rms, shown
 
 
-def _fitted(tracks: xr.Dataset) -> xr.DataArray:
-    """Tell which fits were made: neither does the window leave the frame, nor has the frame bad pixels."""
-    return (tracks["status"] & np.uint8(Status.OUTSIDE_FRAME | Status.BAD_FRAME)) == 0
-
-
-def _good(tracks: xr.Dataset) -> xr.DataArray:
-    return (tracks["status"] & np.uint8(schema.REJECTED)) == 0
-
-
 def _frames_a_bin(n_frames: int, n_columns: int, values: int) -> int:
     """Return how many frames are averaged, so that the series have about so many ``values``.
 
@@ -266,18 +211,10 @@ def _frames_a_bin(n_frames: int, n_columns: int, values: int) -> int:
     >>> _frames_a_bin(40, 34, 1_600_000), _frames_a_bin(20_000, 400, 1_600_000)
     (1, 61)
     """
-    if 2 * len(QUANTITIES) * n_frames * n_columns <= values:
+    if 2 * len(overview.QUANTITIES) * n_frames * n_columns <= values:
         return 1
-    bins = max(2, values // (4 * len(QUANTITIES) * n_columns))
+    bins = max(2, values // (4 * len(overview.QUANTITIES) * n_columns))
     return max(2, -(-n_frames // bins))
-
-
-def _binned(values: xr.DataArray, frames: int) -> Any:
-    """Return groups of so many consecutive frames; chunks are made whole groups first."""
-    if values.chunks is not None:
-        chunk = max(values.chunksizes["frame"])
-        values = values.chunk(frame=max(1, chunk // frames) * frames)
-    return values.coarsen(frame=frames, boundary="pad")
 
 
 def _settings(path: Path) -> RunSettings | None:

@@ -18,6 +18,7 @@ from ..cluster.tries import persist
 from ..progress import (
     REPORT,
     JsonLines,
+    RunState,
     Sink,
     StageDone,
     StageStarted,
@@ -52,7 +53,7 @@ class RunOutcome:
     Attributes
     ----------
     state
-        ``planned``, ``stopped`` (after the stage that was asked for), ``done`` or ``done_with_bad_frames``.
+        Of the run; neither interrupted nor failed.
     seconds
         Time of every stage that worked, in s.
     reused
@@ -61,7 +62,7 @@ class RunOutcome:
 
     outputs: RunFolder
     plan: Plan
-    state: str
+    state: RunState
     frames: int
     columns: int = 0
     fits: int = 0
@@ -140,7 +141,7 @@ def run(
         attempt(partial(check_inputs, opened.shape, settings))
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, expected_limit(settings, client))
-            return RunOutcome(outputs, plan, "planned", plan.frames)
+            return RunOutcome(outputs, plan, RunState.PLANNED, plan.frames)
         attempt(partial(check_output, outputs, opened, settings, overwrite=overwrite))
         with ExitStack() as stack:
             attempt(lambda: stack.enter_context(sole_run(outputs, patience_s)))
@@ -172,10 +173,10 @@ def _run(
                 break
         session.finish_aside()
         if made.movie is None or made.summary is None:
-            session.state = "stopped"
+            session.state = RunState.STOPPED
         else:
             session.attempt(partial(_complete_toml, outputs, settings, made.movie, made.columns))
-            session.state = "done_with_bad_frames" if made.summary.bad_frames else "done"
+            session.state = RunState.DONE_WITH_BAD_FRAMES if made.summary.bad_frames else RunState.DONE
             session.message = "" if record.seconds else "all was done before: nothing to do"
             if report:
                 _report(outputs, session)

@@ -23,6 +23,7 @@ from ..progress import (
     Event,
     RunDone,
     RunStarted,
+    RunState,
     Sink,
     StageDone,
     Warned,
@@ -51,7 +52,7 @@ class Session:
         self._is_given = client is not None
         self.workers, self._sink = LazyClient(cluster, client, self._on_connect), send
         self._refusal: OSError | None = None
-        self.state, self.message = "done", ""
+        self.state, self.message = RunState.DONE, ""
         self._thread, self._asides = ThreadPoolExecutor(1, "aside"), list[tuple[Callable[[], object], Future[object]]]()
 
     def send(self, event: Event) -> None:
@@ -87,7 +88,8 @@ class Session:
         self._thread.shutdown(cancel_futures=True)
         self.workers.close()
         if kind is not None:
-            self.state, self.message = "interrupted" if kind is KeyboardInterrupt else "failed", ""
+            self.state = RunState.INTERRUPTED if kind is KeyboardInterrupt else RunState.FAILED
+            self.message = ""
         self.send(RunDone(self.state, perf_counter() - self._began, self.message))
         if isinstance(error, OSError) and error.errno and not isinstance(error, ConnectionError | TimeoutError):
             raise StoreError(

@@ -24,16 +24,13 @@ import httpx
 
 from ..errors import ClusterError, DestinationError, InputError, ServiceError
 from ..settings.run import RunSettings
-from .jobs.states import ENDED, State
+from .jobs.states import AT_REST, State
 
 if TYPE_CHECKING:
     import xarray as xr
 from .client_answers import check_answer, trusting, values_of
 
 API = "/api/v1"
-
-AT_REST = ENDED | {State.WAITING}
-"""States in which a job stays until somebody does something."""
 
 FORMATS = {".zip": "zarr", ".nc": "nc", ".csv": "csv"}
 """What results can be downloaded as, by the suffix of the file."""

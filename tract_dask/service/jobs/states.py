@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import StrEnum
 
+from ...progress import RunState
+
 
 class State(StrEnum):
     """Where a job is."""
@@ -23,8 +25,18 @@ ENDED = frozenset({State.DONE, State.DONE_WITH_FAILED_FRAMES, State.FAILED, Stat
 RETRYABLE = frozenset({State.FAILED, State.CANCELLED, State.DONE_WITH_FAILED_FRAMES})
 """Another try may end otherwise."""
 
-CURATABLE = frozenset({State.WAITING}) | ENDED
+AT_REST = ENDED | {State.WAITING}
+"""A job stays in such a state until somebody does something."""
+
+CURATABLE = AT_REST
 """Such a job can go on with a version of its columns."""
+
+AFTER_RUN = {
+    RunState.DONE: State.DONE,
+    RunState.DONE_WITH_BAD_FRAMES: State.DONE_WITH_FAILED_FRAMES,
+    RunState.STOPPED: State.WAITING,
+}
+"""What becomes of a job whose run has ended so."""
 
 TRANSITIONS: dict[State, frozenset[State]] = {
     State.QUEUED: frozenset({State.RUNNING, State.CANCELLED}),

@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from ...cluster.forkserver import uncollected
+from ...errors import ExitCode
 
 
 def main() -> int:
@@ -29,7 +30,7 @@ def main() -> int:
             from .job_work import carry_out
         return carry_out(orders.get(), stream)
     except KeyboardInterrupt:  # before the work had begun
-        return 130
+        return ExitCode.INTERRUPTED
 
 
 def _listen(main_thread: int, orders: SimpleQueue[dict[str, Any]]) -> None:

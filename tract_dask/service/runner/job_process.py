@@ -19,6 +19,7 @@ from time import monotonic
 from typing import IO, Any
 
 from ...errors import ClusterError, TractError
+from ...progress import RunState
 from ...readers.listing import FileList
 from ...settings.cluster import ClusterSettings
 from ...settings.toml import to_dict
@@ -26,7 +27,7 @@ from ..checks import inside, job_settings
 from ..crashes import crash_of, crashed
 from ..data_root import DataRoot
 from ..jobs.records import Job, utc_now
-from ..jobs.states import State
+from ..jobs.states import AFTER_RUN, State
 from ..jobs.store import JobStore
 from ..outputs import Mark, check_owner, seal
 from .cluster_process import Keeper
@@ -51,12 +52,6 @@ SHORTEST_BACKOFF_S, LONGEST_BACKOFF_S = 1.0, 300.0
 _LOOK_S = 0.25
 _WORKERS_S = 2.0
 _LAST_LINES = 20
-
-_ENDS = {
-    "done": State.DONE,
-    "done_with_bad_frames": State.DONE_WITH_FAILED_FRAMES,
-    "stopped": State.WAITING,
-}
 
 
 @dataclass
@@ -90,8 +85,8 @@ def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stoppi
     stopping
         Whether the service is about to end.
     """
-    if said.outcome is not None and (cancel_reason is None or said.outcome["state"] != "stopped"):
-        state = _ENDS[said.outcome["state"]]
+    if said.outcome is not None and (cancel_reason is None or said.outcome["state"] != RunState.STOPPED):
+        state = AFTER_RUN[said.outcome["state"]]
         fields = {} if state == State.WAITING else {"outcome": said.outcome}
         reason = "the columns can be looked at" if state == State.WAITING else ""
         return Ending(state, reason, fields | {"lost_tries": 0})

@@ -18,7 +18,7 @@ from distributed.comm import CommClosedError
 from ...cluster.dispatch import JOB
 from ...cluster.tls import using
 from ...cluster.tries import persist
-from ...errors import ClusterError, TractError
+from ...errors import ClusterError, ExitCode, TractError
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, clock, silent
 from ...readers.listing import FileList
 from ...run import pipeline
@@ -158,14 +158,14 @@ def carry_out(order: dict[str, Any], stream: IO[str]) -> int:
             outcome = run_order(order, reporter).to_record()
     except KeyboardInterrupt:
         reporter.end(kind="interrupted")
-        return 130
+        return ExitCode.INTERRUPTED
     except TractError as error:
         reporter.end(kind="error", lost=is_lost(error), text=str(error))
-        return 1
+        return ExitCode.FAILED
     except BaseException as error:  # noqa: BLE001  whatever it is, the job has to say so
         traceback.print_exc()
         text = f"unexpected {type(error).__name__}: {str(error).rstrip('.')}"
         reporter.end(kind="error", lost=is_lost(error), text=text)
-        return 1
+        return ExitCode.FAILED
     reporter.end(kind="outcome", **{name: outcome[name] for name in OUTCOME})
-    return 0
+    return ExitCode.DONE

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ...errors import InputError
+from ...kernels.greys import TRANSPARENT, grey_levels
 from ...readers import open_cached
 from ...readers.listing import FileList
 from ...readers.source import Permit, SourceMetadata
@@ -42,11 +43,8 @@ MOST_PIXELS = 1 << 27
 """Of a frame of a movie that is not converted, which is read as a whole."""
 
 PERCENTILES = (0.1, 0.5, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.5, 99.9)
-CONTRAST = (0.5, 99.5)
-"""Percentiles of a picture that are black and white where it is not said what should be."""
 
 _BINS = 128
-_TRANSPARENT, _BLACK, _WHITE = 0, 1, 255
 
 
 @dataclass(frozen=True)
@@ -289,7 +287,7 @@ def levels(plane: Plane, view: View) -> dict[str, Any]:
 
 
 def _png(plane: Plane, view: View) -> bytes:
-    return encode_png(grey(look(plane, view), view.low, view.high))
+    return encode_png(grey_levels(look(plane, view), view.low, view.high))
 
 
 def look(plane: Plane, view: View) -> Floats:
@@ -354,20 +352,6 @@ def _overlap(edges: NDArray[np.float64], side: int) -> csr_array[np.float32]:
     return csr_array((length.astype(np.float32), (interval, pixel)), shape=(len(edges) - 1, side))
 
 
-def grey(seen: Floats, low: float | None = None, high: float | None = None) -> NDArray[np.uint8]:
-    """Return values as grey levels: 1 at ``low`` and below, 255 at ``high`` and above, 0 where there is no value."""
-    known = np.isfinite(seen)
-    if not known.any():
-        return np.zeros(seen.shape, np.uint8)
-    usual = np.percentile(seen[known], CONTRAST) if low is None or high is None else (0.0, 1.0)
-    black, white = (float(usual[0]) if low is None else low), (float(usual[1]) if high is None else high)
-    span = white - black if white - black > np.finfo(np.float32).tiny else 1.0
-    with np.errstate(over="ignore"):  # it is clipped
-        share = (np.where(known, seen, 0) - black) / span
-    level = _BLACK + np.rint((_WHITE - _BLACK) * np.clip(share, 0, 1))
-    return np.where(known, level, _TRANSPARENT).astype(np.uint8)
-
-
 def encode_png(level: NDArray[np.uint8]) -> bytes:
     """Return grey levels (rows, columns) as PNG, of which level 0 is transparent; fast rather than small."""
     height, width = level.shape
@@ -375,7 +359,7 @@ def encode_png(level: NDArray[np.uint8]) -> bytes:
     lines[:, 1:] = level
     parts = {
         b"IHDR": struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0),
-        b"tRNS": struct.pack(">H", _TRANSPARENT),
+        b"tRNS": struct.pack(">H", TRANSPARENT),
         b"IDAT": bytes(imagecodecs.deflate_encode(lines.tobytes(), level=1, raw=False)),
         b"IEND": b"",
     }

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from ...analysis import motion
+from ...analysis import motion, overview
+from ...analysis.overview import Calibration, Floats
 from ...errors import InputError, SettingsError
 from ...kernels.gaussian import parameters
 from ...settings.run import FitSettings
@@ -23,46 +23,20 @@ from ...settings.toml import from_toml, load, to_dict
 from ...store import datasets, metadata, results, schema
 from ...store.run_folder import RunFolder
 from .pictures import as_json
-from .track_cache import QUANTITIES, open_tracks
-
-Floats = NDArray[np.float64]
+from .track_cache import open_tracks
 
 _DIGITS = 6
-
-
-@dataclasses.dataclass(frozen=True)
-class Calibration:
-    """What the numbers of a store mean."""
-
-    pixel_size_pm: float | None
-    frame_time_s: float | None
-    dose: float | None
-
-    @property
-    def scale(self) -> float:
-        """Lengths in :attr:`unit` for one px."""
-        return self.pixel_size_pm or 1.0
-
-    @property
-    def unit(self) -> str:
-        """Of lengths."""
-        return "pm" if self.pixel_size_pm else "px"
-
-    @property
-    def time_unit(self) -> str:
-        """Of times: frames where the time of one is not known."""
-        return "s" if self.frame_time_s else "frames"
-
-    def times(self, frames: Floats) -> Floats:
-        """Return the times of frames."""
-        return frames * (self.frame_time_s or 1.0)
+_COLUMN_NUMBERS = {"sd": "spread", "sd_x": "sd_x", "sd_y": "sd_y", "stated": "expected", "accepted_share": "share"}
+_COLUMN_NUMBERS["intensity"] = "intensity"
+"""Numbers of the API by the names that they have in the overview."""
 
 
 def summary(folder: Path, cache: Path, version: str) -> bytes:
     """Return how much is done, what was measured, and how."""
     path = RunFolder(folder).results
     tracks, known, about = open_tracks(path, cache), _calibration(path), metadata.attributes(path)
-    sizes = len(tracks.done), len(tracks.columns["fits"])
+    counts = dict(zip(overview.COUNTS, tracks.columns.counts, strict=True))
+    sizes = len(tracks.done), len(counts["fits"])
     return as_json(
         {
             "version": version,
@@ -70,8 +44,8 @@ def summary(folder: Path, cache: Path, version: str) -> bytes:
             "shards": {"done": int(tracks.shards.sum()), "total": len(tracks.shards)},
             "frames": {"done": int(tracks.done.sum()), "total": sizes[0]},
             "columns": sizes[1],
-            "fits": int(tracks.columns["fits"].sum()),
-            "accepted": int(tracks.columns["accepted"].sum()),
+            "fits": int(counts["fits"].sum()),
+            "accepted": int(counts["accepted"].sum()),
             **dataclasses.asdict(known),
             "unit": known.unit,
             "time_unit": known.time_unit,
@@ -93,31 +67,17 @@ def columns(folder: Path, cache: Path, version: str) -> bytes:
     """Return the numbers of every column."""
     path = RunFolder(folder).results
     tracks, known, static = open_tracks(path, cache), _calibration(path), _static(path)
-    of = tracks.columns
-    count = of["accepted"]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sd_x, sd_y = (
-            known.scale * np.sqrt(np.where(count > 1, of[name], np.nan) / (count - 1)) for name in ("xx", "yy")
-        )
-        numbers = {
-            "sd": np.sqrt((sd_x**2 + sd_y**2) / 2),
-            "sd_x": sd_x,
-            "sd_y": sd_y,
-            "stated": known.scale * np.sqrt(np.where(count > 0, of["variance"], np.nan) / (2 * count)),
-            "accepted_share": count / np.where(of["fits"] > 0, of["fits"], np.nan),
-            "intensity": np.where(count > 0, of["intensity"], np.nan),
-        }
+    of = tracks.columns.numbers(known.scale)
     table = {
         "column_id": static["column_id"].to_numpy().tolist(),
         "x": numbers_of(static["x_ref"].to_numpy()),
         "y": numbers_of(static["y_ref"].to_numpy()),
         "kind": [str(kind) for kind in static["kind"].to_numpy()],
-        "fits": of["fits"].astype(int).tolist(),
-        "accepted": count.astype(int).tolist(),
-        **{name: numbers_of(values) for name, values in numbers.items()},
+        "fits": of["fits"].tolist(),
+        "accepted": of["accepted"].tolist(),
+        **{name: numbers_of(of[number]) for name, number in _COLUMN_NUMBERS.items()},
     }
-    rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
-    return as_json({"version": version, "unit": known.unit, "columns": rows})
+    return as_json({"version": version, "unit": known.unit, "columns": _rows(table)})
 
 
 def series(
@@ -158,14 +118,14 @@ def series(
         "frames_per_point": step,
         "frame": list(range(start, stop, step)),
         "t": numbers_of(known.times(_middles(start, stop, step))),
-        "accepted": _groups(np.isfinite(own["x"]), step, False).sum(axis=1).astype(int).tolist(),
+        "accepted": np.add.reduceat(np.isfinite(own["x"]), np.arange(0, stop - start, step), dtype=int).tolist(),
     }
-    for name in QUANTITIES:
+    for name in overview.QUANTITIES:
         values, error = own[name], own[f"{name}_stderr"]
-        found |= _binned(name, values, error, step)
+        found |= _points(name, values, error, step)
         if name in reference:
             away = known.scale * (values - reference[name])
-            found |= _binned(f"d{name}", away, known.scale * error, step)
+            found |= _points(f"d{name}", away, known.scale * error, step)
     return as_json(found)
 
 
@@ -173,10 +133,9 @@ def frames(folder: Path, cache: Path, points: int, version: str) -> bytes:
     """Return drift, share of accepted fits and mean amplitude over the frames, averaged where they are many."""
     path = RunFolder(folder).results
     tracks, known = open_tracks(path, cache), _calibration(path)
-    n_frames, of = len(tracks.done), tracks.frames
+    n_frames = len(tracks.done)
     step = -(-n_frames // points)
-    fits, accepted = (_groups(np.nan_to_num(of[name]), step, 0.0).sum(axis=1) for name in ("fits", "accepted"))
-    means = {name: _mean(of[name], step) for name in ("drift_x", "drift_y", "amplitude")}
+    found = overview.frame_curves(tracks.frames, step)
     return as_json(
         {
             "version": version,
@@ -185,8 +144,8 @@ def frames(folder: Path, cache: Path, points: int, version: str) -> bytes:
             "frames_per_point": step,
             "frame": list(range(0, n_frames, step)),
             "t": numbers_of(known.times(_middles(0, n_frames, step))),
-            "accepted_share": numbers_of(accepted / np.where(fits > 0, fits, np.nan)),
-            **{name: numbers_of(values) for name, values in means.items()},
+            "accepted_share": numbers_of(found["share"]),
+            **{name: numbers_of(found[name]) for name in ("drift_x", "drift_y", "amplitude")},
         }
     )
 
@@ -214,9 +173,12 @@ def displacement(folder: Path, first: int, second: int, version: str) -> bytes:
         "y": numbers_of(tracks["y_ref"].to_numpy()),
         **{name.replace("d_", "d"): numbers_of(of) for name, of in values.items()},
     }
-    rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
-    told = {"version": version, "first": first, "second": second, "unit": known.unit, "columns": rows}
-    return as_json(told)
+    about = {"version": version, "first": first, "second": second, "unit": known.unit}
+    return as_json(about | {"columns": _rows(table)})
+
+
+def _rows(table: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
 
 def _only(path: Path, frames: tuple[int, ...]) -> xr.Dataset:
@@ -265,8 +227,7 @@ def numbers_of(values: Floats) -> list[float | None]:
 
 
 def _calibration(path: Path) -> Calibration:
-    about = metadata.attributes(path)
-    return Calibration(about.get("pixel_size_pm"), about.get("frame_time_s"), about.get("dose"))
+    return Calibration.of(metadata.attributes(path))
 
 
 def _static(path: Path) -> xr.Dataset:
@@ -288,46 +249,16 @@ def _range(frames: tuple[int, int | None], n_frames: int) -> tuple[int, int]:
     return start, stop
 
 
-def _groups(values: NDArray[Any], step: int, fill: Any) -> NDArray[Any]:
-    """Return groups of ``step`` consecutive values, (groups, step); the last is filled up."""
-    missing = -len(values) % step
-    return np.concatenate([values, np.full(missing, fill, values.dtype)]).reshape(-1, step)
-
-
 def _middles(start: int, stop: int, step: int) -> Floats:
     first = np.arange(start, stop, step)
     return (first + np.minimum(first + step, stop) - 1) / 2
 
 
-def _mean(values: Floats, step: int) -> Floats:
-    """Return the means of groups of values; NaN where a group has none."""
-    groups = _groups(values, step, np.nan)
-    known = np.isfinite(groups)
-    count = known.sum(axis=1)
-    means: Floats = np.where(known, groups, 0).sum(axis=1) / np.where(count > 0, count, np.nan)
-    return means
-
-
-def _binned(name: str, values: Floats, error: Floats, step: int) -> dict[str, Any]:
-    """Return means over groups of frames and their standard errors; of groups of more than one also the extremes.
-
-    The error of a mean is that which the errors of its values make, sqrt(sum of squares) / number; where these are not
-    known, it comes from the spread of the values.
-    """
-    groups, errors = _groups(values, step, np.nan), _groups(error, step, np.nan)
-    known = np.isfinite(groups)
-    count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
-    mean = np.where(known, groups, 0).sum(axis=1) / count
-    stated = np.sqrt((np.where(known, errors, 0) ** 2).sum(axis=1)) / count
-    squares = np.where(known, (groups - mean[:, None]) ** 2, 0).sum(axis=1)
-    seen = np.sqrt(squares / np.where(count > 1, count - 1, np.nan) / count)
-    told = {name: mean, f"{name}_stderr": np.where(np.isfinite(stated), stated, seen)}
-    if step > 1:
-        told |= {
-            f"{name}_low": np.where(known, groups, np.inf).min(axis=1),
-            f"{name}_high": np.where(known, groups, -np.inf).max(axis=1),
-        }
-    return {key: numbers_of(of) for key, of in told.items()}
+def _points(name: str, values: Floats, error: Floats, step: int) -> dict[str, Any]:
+    """Return means over groups of frames and their standard errors; of groups of more than one also the extremes."""
+    found = overview.binned(values, error, step)
+    suffixes = {"mean": "", "error": "_stderr"} | ({"low": "_low", "high": "_high"} if step > 1 else {})
+    return {f"{name}{suffix}": numbers_of(found[kind]) for kind, suffix in suffixes.items()}
 
 
 def _settings(folder: Path, about: dict[str, Any]) -> dict[str, Any]:

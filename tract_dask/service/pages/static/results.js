@@ -102,7 +102,7 @@ function pick(range) {
 function figures() {
   const median = (name) => {
     const known = rows.map((row) => row[name]).filter((value) => value !== null).sort((a, b) => a - b);
-    return known.length ? known[known.length >> 1] : null;
+    return known.length ? (known[(known.length - 1) >> 1] + known[known.length >> 1]) / 2 : null;
   };
   const tiles = [
     ["Frames", count(summary.frames.done), summary.complete ? "" : `of ${count(summary.frames.total)}`],
