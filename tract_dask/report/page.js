@@ -2,22 +2,25 @@
 
 import { lineChart } from "./charts.js";
 import { ColumnMap } from "./column_map.js";
-import { setText } from "./dom.js";
+import { at, setText } from "./dom.js";
 import { significant } from "./format.js";
 import { drawColourBar, scaleOf } from "./number_colours.js";
 import { scatterChart } from "./scatter_chart.js";
 import { theme } from "./theme_colours.js";
 
+/** @typedef {{ numbers: Int16Array, zero: Float64Array, step: Float64Array }} Packed */
+
 const MISSING = -32768; // of 16 bit numbers
 const FEW = 400; // points, up to which each is drawn
 const CHOSEN = 2; // the colour of the chosen column, everywhere
 
-const at = (id) => document.getElementById(id);
-const data = JSON.parse(at("data").textContent);
+const data = JSON.parse(at("data").textContent ?? "");
 const { unit, time_unit: timeUnit, ids, kinds, shades } = data;
 const columns = unpackAll(data.columns), frames = unpackAll(data.frames), time = unpack(data.series.time);
 const inTime = { group: "series", formatX: (value) => `${significant(value, 6)} ${timeUnit}` };
-let chosen = -1, scale = null;
+let chosen = -1;
+/** @type {ReturnType<typeof scaleOf>} */
+let scale = null;
 
 function unpack({ dtype, base64 }) {
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
@@ -27,9 +30,13 @@ function unpack({ dtype, base64 }) {
 function unpackAll(packed) { return Object.fromEntries(Object.entries(packed).map(([name, one]) => [name, unpack(one)])); }
 
 const series = Object.fromEntries(["x", "y", "intensity"].map((name) =>
-  [name, Object.fromEntries(Object.entries(data.series[name]).map(([kind, one]) => [kind, unpackAll(one)]))]));
+  [name, Object.fromEntries(Object.entries(data.series[name]).map(([kind, one]) => [kind, /** @type {Packed} */ (unpackAll(one))]))]));
 
-/** The values of a column in time; NaN where no fit is accepted. */
+/**
+ * The values of a column in time; NaN where no fit is accepted.
+ * @param {Packed} packed
+ * @param {number} column
+ */
 function valuesOf({ numbers, zero, step }, column) {
   const own = numbers.subarray(column * time.length, (column + 1) * time.length);
   return Float64Array.from(own, (number) => (number === MISSING ? NaN : zero[column] + step[column] * number));
@@ -75,21 +82,21 @@ const share = columns.share && columns.r_squared && scatterChart(at("share"), {
 const scatters = [spread, share].filter(Boolean);
 
 function colour() {
-  const shade = shades.find(({ name }) => name === at("shade").value);
-  scale = shade ? scaleOf([...columns[shade.name]]) : null;
-  map.show({ colourOf: ({ index }) => (scale && Number.isFinite(columns[shade.name][index]) ? scale.colour(columns[shade.name][index]) : null) });
+  const shade = shades.find(({ name }) => name === at("shade", HTMLSelectElement).value), found = shade ? scaleOf([...columns[shade.name]]) : null;
+  scale = found;
+  map.show({ colourOf: ({ index }) => (found && Number.isFinite(columns[shade.name][index]) ? found.colour(columns[shade.name][index]) : null) });
   drawBar();
 }
 
 function drawBar() {
-  const shade = shades.find(({ name }) => name === at("shade").value);
-  drawColourBar(at("colour-bar"), scale, shade ? `${shade.label}${shade.unit ? ` (${shade.unit})` : ""}` : "");
+  const shade = shades.find(({ name }) => name === at("shade", HTMLSelectElement).value);
+  drawColourBar(at("colour-bar", HTMLCanvasElement), scale, shade ? `${shade.label}${shade.unit ? ` (${shade.unit})` : ""}` : "");
 }
 
 /** Show a column in time, and where it is among the others. */
 function choose(index) {
   chosen = index;
-  at("column").value = String(index);
+  at("column", HTMLSelectElement).value = String(index);
   setText(at("chosen"), `${ids[index]}${kinds[index] ? ` (${kinds[index]})` : ""}`);
   setText(at("said"), shades.map((shade) => `${shade.label} ${textOf(shade, index)}`).join(" · "));
   for (const [name, chart] of Object.entries(charts)) chart.update({ label: `${name} of column ${ids[index]} in time`, empty: "No fit is accepted", series: seriesOf(name) });
@@ -111,7 +118,7 @@ const frameCharts = [
 ];
 
 async function showImage() {
-  const picture = at("summed"), { width, height, covered, pixel_size_pm: pixelSizePm } = data.image;
+  const picture = at("summed", HTMLImageElement), { width, height, covered, pixel_size_pm: pixelSizePm } = data.image;
   await picture.decode();
   const bitmap = await createImageBitmap(picture);
   picture.remove();
@@ -121,11 +128,12 @@ async function showImage() {
 
 function listen() {
   const step = (by) => choose((chosen + by + ids.length) % ids.length);
-  at("column").addEventListener("change", () => choose(Number(at("column").value)));
+  const column = at("column", HTMLSelectElement);
+  column.addEventListener("change", () => choose(Number(column.value)));
   at("before").addEventListener("click", () => step(-1));
   at("after").addEventListener("click", () => step(1));
   at("shade").addEventListener("change", colour);
-  for (const button of document.querySelectorAll(".go")) {
+  for (const button of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll(".go"))) {
     button.addEventListener("click", () => {
       choose(Number(button.dataset.place));
       at("look").scrollIntoView({ behavior: "smooth" });
@@ -133,7 +141,7 @@ function listen() {
   }
   addEventListener("resize", drawBar);
   theme.onChange(() => { drawBar(); mark(); });
-  const { dataset } = document.documentElement, before = { theme: "" };
+  const { dataset } = document.documentElement, before = { theme: dataset.theme };
   addEventListener("beforeprint", () => { // on white paper, and at once
     before.theme = dataset.theme;
     dataset.theme = "light";

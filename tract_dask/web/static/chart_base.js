@@ -1,18 +1,34 @@
 // What all charts have in common: a canvas that stays sharp and follows the theme, a legend, axes.
 
-import { h } from "./dom.js";
+import { h, penOf } from "./dom.js";
 import { tickText, ticks } from "./chart_scale.js";
 import { theme } from "./theme_colours.js";
 import { stroke } from "./chart_paint.js";
 
+/**
+ * @import { Range } from "./chart_scale.js"
+ * @typedef {{ left: number, right: number, top: number, bottom: number }} Inside of the axes, px
+ * @typedef {{ text: string, line: string, panel: string, accent: string }} Ink
+ * @typedef {{ x: (value: number) => number, y: (value: number) => number, toX: (px: number) => number, toY: (px: number) => number }} Places
+ * @typedef {{ range: Range, values: number[], texts: string[], room: number }} Axis
+ * @typedef {{ xLabel?: string, yLabel?: string, rightLabel?: string }} Labels
+ * @typedef {{ label?: string, height: number, empty: string }} ChartOptions that all kinds have
+ */
+
 const FONT = '11.5px system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif';
 
-/** A chart, redrawn whole, at most once a frame of the screen. Its kinds add listen(), makeLegend(), paint() and chooseView(). */
+/**
+ * A chart, redrawn whole, at most once a frame of the screen. Its kinds say what is empty here.
+ * @template {ChartOptions} Options
+ */
 export class Chart {
+  /**
+   * @param {HTMLElement} element
+   * @param {Options} options
+   */
   constructor(element, options) {
     this.options = options;
     this.frame = 0;
-    this.drag = null; // the user's, in px
     this.legend = h("div", { class: "chart-legend" });
     this.canvas = h("canvas", { tabindex: 0, role: "img", style: { height: `${options.height}px` } });
     this.whole = h("button", { type: "button", class: "button small chart-whole", hidden: true, onclick: () => this.chooseView(null) }, "Whole range");
@@ -28,6 +44,15 @@ export class Chart {
     this.draw();
   }
 
+  listen() {}
+
+  makeLegend() {}
+
+  paint() {}
+
+  /** @param {any} _view what the user chose to see, as the kind has it; null: all */
+  chooseView(_view) {}
+
   destroy() {
     this.sizes.disconnect();
     this.stopTheme();
@@ -35,7 +60,10 @@ export class Chart {
     this.element.replaceChildren();
   }
 
-  /** A color of the options: a number is that of a series, a name a variable of the style sheet. */
+  /**
+   * A color of the options: a number is that of a series, a name a variable of the style sheet.
+   * @param {number | string} color
+   */
   colour(color) {
     return typeof color === "number" ? theme.color(`--series-${color}`) : color.startsWith("--") ? theme.color(color) : color;
   }
@@ -51,7 +79,7 @@ export class Chart {
     const ratio = devicePixelRatio || 1;
     const [pixelsX, pixelsY] = [Math.round(width * ratio), Math.round(height * ratio)];
     if (this.canvas.width !== pixelsX || this.canvas.height !== pixelsY) Object.assign(this.canvas, { width: pixelsX, height: pixelsY });
-    const pen = this.canvas.getContext("2d");
+    const pen = penOf(this.canvas);
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     pen.font = FONT;
@@ -59,7 +87,11 @@ export class Chart {
     return { pen, width, height, ink };
   }
 
-  /** What the user drags over, from corner to corner. */
+  /**
+   * What the user drags over, from corner to corner.
+   * @param {CanvasRenderingContext2D} pen
+   * @param {Ink} ink
+   */
   paintDrag(pen, ink, x0, y0, x1, y1) {
     pen.globalAlpha = 0.18;
     pen.fillStyle = ink.accent;
@@ -67,9 +99,17 @@ export class Chart {
     pen.globalAlpha = 1;
   }
 
-  /** The text of a chart without data, or of what is in it. */
+  /**
+   * The text of a chart without data, or of what is in it.
+   * @param {string} text
+   */
   speak(text) { this.canvas.setAttribute("aria-label", `${this.options.label ?? "Chart"}: ${text}`); }
 
+  /**
+   * @param {CanvasRenderingContext2D} pen
+   * @param {Inside} box
+   * @param {Ink} ink
+   */
   paintEmpty(pen, box, ink) {
     pen.fillStyle = ink.text;
     pen.textAlign = "center";
@@ -78,10 +118,20 @@ export class Chart {
   }
 }
 
-/** The inside of the axes, in px; `axes` are those at the left and, if there is one, at the right; `top`: room for labels above. */
+/**
+ * The inside of the axes, in px; `axes` are those at the left and, if there is one, at the right; `top`: room for labels above.
+ * @param {Axis[]} axes
+ * @returns {Inside}
+ */
 export const boxOf = (axes, width, height, top = 24) => ({ left: axes[0].room, right: width - (axes[1] ? axes[1].room : 10), top, bottom: height - 32 });
 
-/** Where values lie in the box: { x(value), y(value) } in px, and { toX(px), toY(px) } back. */
+/**
+ * Where values lie in the box: { x(value), y(value) } in px, and { toX(px), toY(px) } back.
+ * @param {Inside} box
+ * @param {Range} xRange
+ * @param {Range} yRange
+ * @returns {Places}
+ */
 export function places(box, [x0, x1], [y0, y1]) {
   const wide = (box.right - box.left) / (x1 - x0), high = (box.bottom - box.top) / (y1 - y0);
   return {
@@ -90,7 +140,13 @@ export function places(box, [x0, x1], [y0, y1]) {
   };
 }
 
-/** An upright axis: its range, its ticks, and the room that their texts need. */
+/**
+ * An upright axis: its range, its ticks, and the room that their texts need.
+ * @param {CanvasRenderingContext2D} pen
+ * @param {Range} range
+ * @param {number} height
+ * @returns {Axis}
+ */
 export function axisOf(pen, range, height) {
   const wanted = Math.max(2, Math.round((height - 52) / 38));
   const few = ticks(...range, wanted);
@@ -99,7 +155,15 @@ export function axisOf(pen, range, height) {
   return { range, values, texts, room: Math.max(28, ...texts.map((text) => pen.measureText(text).width)) + 10 };
 }
 
-/** Draw the axes at the left and, if there is one, at the right, and that of x over `bounds`, with the labels of `options`. */
+/**
+ * Draw the axes at the left and, if there is one, at the right, and that of x over `bounds`, with the labels of `options`.
+ * @param {CanvasRenderingContext2D} pen
+ * @param {Inside} box
+ * @param {Axis[]} axes
+ * @param {Range} bounds
+ * @param {Ink} ink
+ * @param {Labels} labels
+ */
 export function paintAxes(pen, box, axes, bounds, ink, { xLabel, yLabel, rightLabel }, width, height) {
   pen.lineWidth = 1;
   pen.textBaseline = "middle";
@@ -133,7 +197,11 @@ export function paintAxes(pen, box, axes, bounds, ink, { xLabel, yLabel, rightLa
   pen.textBaseline = "middle";
 }
 
-/** Let what follows be drawn inside the box only, until pen.restore(). */
+/**
+ * Let what follows be drawn inside the box only, until pen.restore().
+ * @param {CanvasRenderingContext2D} pen
+ * @param {Inside} box
+ */
 export function clip(pen, box) {
   pen.save();
   pen.beginPath();

@@ -2,7 +2,33 @@
 
 import { firstNotBelow } from "./chart_scale.js";
 
-/** Draw a series of charts.js in `colour`; `place` maps x and y to px, `box` is the inside of the axes. */
+/**
+ * @import { Inside, Places } from "./chart_base.js"
+ * @import { Gappy, Range } from "./chart_scale.js"
+ * @typedef {object} Series of a chart, as charts.js says
+ * @property {string} [name]
+ * @property {ArrayLike<number>} x
+ * @property {Gappy} y
+ * @property {Gappy} [low]
+ * @property {Gappy} [high]
+ * @property {number | string} [color]
+ * @property {string} [kind]
+ * @property {boolean} [right]
+ * @property {string} [unit]
+ * @property {boolean} [dashed]
+ * @typedef {[x: number, y: number]} Spot in px
+ * @typedef {{ x: number, low: number, high: number }} Slice of a band, px
+ */
+
+/**
+ * Draw a series of charts.js in `colour`; `place` maps x and y to px, `box` is the inside of the axes.
+ * @param {CanvasRenderingContext2D} pen
+ * @param {Series} one
+ * @param {string} colour
+ * @param {Range} bounds
+ * @param {Places} place
+ * @param {Inside} box
+ */
 export function paintSeries(pen, one, colour, [x0, x1], place, box) {
   if (!one.y.length) return;
   pen.strokeStyle = pen.fillStyle = colour;
@@ -31,20 +57,32 @@ export function paintSeries(pen, one, colour, [x0, x1], place, box) {
   if (one.kind !== "points" && one.kind !== "dots") return;
   const size = Math.max(1, Math.min(2.6, (box.right - box.left) / (stop - start) / 2.5));
   for (let index = start; index < stop; index += 1) {
-    if (known(one.y[index])) dot(pen, place.x(one.x[index]), place.y(one.y[index]), size, colour);
+    const y = one.y[index];
+    if (known(y)) dot(pen, place.x(one.x[index]), place.y(y), size, colour);
   }
 }
 
+/**
+ * @param {CanvasRenderingContext2D} pen
+ * @param {Series} one
+ * @param {Places} place
+ * @param {Inside} box
+ */
 function paintBars(pen, one, place, box) {
   const floor = Math.min(place.y(0), box.bottom);
   pen.globalAlpha = 0.75;
-  one.y.forEach((value, index) => {
-    const left = place.x(one.x[index]), right = place.x(one.x[index + 1]), top = place.y(value);
+  [...one.y].forEach((value, index) => {
+    const left = place.x(one.x[index]), right = place.x(one.x[index + 1]), top = place.y(value ?? 0);
     if (value) pen.fillRect(left + 0.5, top, Math.max(right - left - 1, 1), floor - top);
   });
   pen.globalAlpha = 1;
 }
 
+/**
+ * @param {CanvasRenderingContext2D} pen
+ * @param {Series} one
+ * @param {Places} place
+ */
 function paintBand(pen, one, start, stop, place) {
   pen.globalAlpha = 0.2;
   for (const run of bands(one, start, stop, place)) {
@@ -57,26 +95,39 @@ function paintBand(pen, one, start, stop, place) {
   pen.globalAlpha = 1;
 }
 
-/** The runs of a band between gaps, in px; where several fall on a pixel, as far as they reach together. */
+/**
+ * The runs of a band between gaps, in px; where several fall on a pixel, as far as they reach together.
+ * @param {Series} one
+ * @param {Places} place
+ */
 function bands(one, start, stop, place) {
+  /** @type {Slice[][]} */
   const runs = [];
-  let run = null;
+  let run = /** @type {Slice[] | null} */ (null);
   for (let index = start; index < stop; index += 1) {
-    if (!known(one.low[index]) || !known(one.high[index])) { run = null; continue; }
+    const least = one.low?.[index], most = one.high?.[index];
+    if (!known(least) || !known(most)) { run = null; continue; }
     if (!run) runs.push(run = []);
-    const x = place.x(one.x[index]), low = place.y(one.low[index]), high = place.y(one.high[index]), last = run[run.length - 1];
+    const x = place.x(one.x[index]), low = place.y(least), high = place.y(most), last = run[run.length - 1];
     if (last && Math.floor(last.x) === Math.floor(x)) Object.assign(last, { low: Math.max(last.low, low), high: Math.min(last.high, high) });
     else run.push({ x, low, high });
   }
   return runs;
 }
 
-/** The runs between gaps as points in px; where several fall on a pixel, its first, lowest, highest and last. */
+/**
+ * The runs between gaps as points in px; where several fall on a pixel, its first, lowest, highest and last.
+ * @param {ArrayLike<number>} xs
+ * @param {Gappy} ys
+ * @param {Places} place
+ */
 function thinned(xs, ys, start, stop, place) {
+  /** @type {Spot[][]} */
   const runs = [];
-  let run = null, column = null;
+  let run = /** @type {Spot[] | null} */ (null);
+  let column = /** @type {{ pixel: number, first: Spot, low: Spot, high: Spot, last: Spot } | null} */ (null);
   const flush = () => {
-    if (!column) return;
+    if (!column || !run) return;
     const { first, low, high, last } = column;
     run.push(first);
     if (low !== first && low !== last) run.push(low);
@@ -85,9 +136,10 @@ function thinned(xs, ys, start, stop, place) {
     column = null;
   };
   for (let index = start; index < stop; index += 1) {
-    if (!known(ys[index])) { flush(); run = null; continue; }
+    const y = ys[index];
+    if (!known(y)) { flush(); run = null; continue; }
     if (!run) runs.push(run = []);
-    const point = [place.x(xs[index]), place.y(ys[index])], pixel = Math.floor(point[0]);
+    const point = /** @type {Spot} */ ([place.x(xs[index]), place.y(y)]), pixel = Math.floor(point[0]);
     if (column?.pixel !== pixel) { flush(); column = { pixel, first: point, low: point, high: point, last: point }; continue; }
     column.last = point;
     if (point[1] < column.low[1]) column.low = point;
@@ -97,9 +149,20 @@ function thinned(xs, ys, start, stop, place) {
   return runs;
 }
 
-const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
+/**
+ * @param {number | null | undefined} value
+ * @returns {value is number}
+ */
+function known(value) { return typeof value === "number" && Number.isFinite(value); }
 
-/** Draw a straight line. */
+/**
+ * Draw a straight line.
+ * @param {CanvasRenderingContext2D} pen
+ * @param {number} x0
+ * @param {number} y0
+ * @param {number} x1
+ * @param {number} y1
+ */
 export function stroke(pen, x0, y0, x1, y1) {
   pen.lineWidth = 1;
   pen.beginPath();
@@ -108,7 +171,14 @@ export function stroke(pen, x0, y0, x1, y1) {
   pen.stroke();
 }
 
-/** Draw a disc, with an edge where it shall stand out. */
+/**
+ * Draw a disc, with an edge where it shall stand out.
+ * @param {CanvasRenderingContext2D} pen
+ * @param {number} x
+ * @param {number} y
+ * @param {number} radius
+ * @param {string} colour
+ */
 export function dot(pen, x, y, radius, colour, edge = "") {
   pen.beginPath();
   pen.arc(x, y, radius, 0, 2 * Math.PI);

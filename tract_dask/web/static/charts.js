@@ -7,13 +7,33 @@ import { axisOf, boxOf, Chart, clip, paintAxes, places } from "./chart_base.js";
 import { dot, paintSeries, stroke } from "./chart_paint.js";
 import { extend, firstNotBelow, nearest, padded } from "./chart_scale.js";
 
+/**
+ * @import { ChartOptions, Ink, Inside, Labels, Places } from "./chart_base.js"
+ * @import { Series } from "./chart_paint.js"
+ * @import { Edges, Range } from "./chart_scale.js"
+ * @typedef {object} LineOptions
+ * @property {Series[]} series
+ * @property {Edges} [xRange]
+ * @property {Edges} [yRange]
+ * @property {Edges} [rightRange]
+ * @property {(value: number) => string} formatX
+ * @property {(value: number) => string} formatY
+ * @property {{ x: number, label?: string }[]} markers
+ * @property {number[]} levels
+ * @property {string} [group]
+ * @property {(range: Range | null) => void} [onRange]
+ * @property {(x: number) => void} [onPick]
+ * @typedef {Partial<LineOptions & ChartOptions & Labels>} LineChanges
+ * @typedef {{ x: number, y: number | null, low?: number | null, high?: number | null, text?: string }} Found under the pointer
+ */
+
 const DRAG_PX = 5; // a shorter drag is a click
 
 /**
  * A chart of lines, bands, points or bars over a common x.
  *
  * @param {HTMLElement} element where it goes; it takes the width, and keeps its height
- * @param {object} options
+ * @param {LineChanges} options
  *   label: what it shows, for screen readers;  height: px (200)
  *   series: [{ name, x, y, low, high, color, kind, right, unit, dashed }]: `x` ascending; null and NaN are gaps;
  *     `low`, `high` a band; `color` 1 to 6 (a series variable of theme.css) or a CSS colour; `kind` "line", "area", "points",
@@ -29,27 +49,45 @@ const DRAG_PX = 5; // a shorter drag is a click
  */
 export const lineChart = (element, options) => new LineChart(element, options);
 
-/** A histogram: `edges` one more than `counts`. Further options as of lineChart. */
+/**
+ * A histogram: `edges` one more than `counts`. Further options as of lineChart.
+ * @param {HTMLElement} element
+ * @param {{ edges: number[], counts: number[], name?: string, color?: number } & LineChanges} options
+ */
 export function histogram(element, { edges, counts, name = "", color = 1, ...options }) {
   const bars = (e, c) => [{ name, x: e, y: c, color, kind: "bars" }];
   const chart = lineChart(element, { yRange: [0, null], ...options, series: bars(edges, counts) });
   return {
-    update: (changes) => chart.update({ ...changes, ...(changes.edges ? { series: bars(changes.edges, changes.counts) } : {}) }),
+    /** @param {LineChanges & { edges?: number[], counts?: number[] }} changes */
+    update: (changes) => chart.update({ ...changes, ...(changes.edges && changes.counts ? { series: bars(changes.edges, changes.counts) } : {}) }),
     destroy: () => chart.destroy(),
   };
 }
 
+/** @type {Map<string, Set<LineChart>>} */
 const groups = new Map();
 
+/** @extends {Chart<LineOptions & ChartOptions & Labels>} */
 class LineChart extends Chart {
+  /**
+   * @param {HTMLElement} element
+   * @param {LineChanges} options
+   */
   constructor(element, options) {
     super(element, { height: 200, series: [], markers: [], levels: [], empty: "No data yet", formatY: (value) => significant(value, 4), formatX: (value) => significant(value, 5), ...options });
+    /** @type {Range | null} */
     this.view = null; // x range chosen by the user; null: all
+    /** @type {number | null} */
     this.pointer = null; // x under the pointer
+    /** @type {Range | null} */
+    this.drag = null; // the user's, in px
     if (options.group) groups.set(options.group, (groups.get(options.group) ?? new Set()).add(this));
   }
 
-  /** Change any option; the view stays where the user has put it. */
+  /**
+   * Change any option; the view stays where the user has put it.
+   * @param {LineChanges} changes
+   */
   update(changes) {
     const names = this.names();
     Object.assign(this.options, changes);
@@ -57,7 +95,10 @@ class LineChart extends Chart {
     this.draw();
   }
 
-  /** Show the x range; null shows all. */
+  /**
+   * Show the x range; null shows all.
+   * @param {Range | null} range
+   */
   zoom(range) {
     this.view = range;
     this.whole.hidden = range === null;
@@ -65,7 +106,7 @@ class LineChart extends Chart {
   }
 
   destroy() {
-    groups.get(this.options.group)?.delete(this);
+    groups.get(this.options.group ?? "")?.delete(this);
     super.destroy();
   }
 
@@ -73,12 +114,18 @@ class LineChart extends Chart {
 
   makeLegend() {
     const many = this.options.series.length > 1;
+    /** @type {HTMLElement[]} */
     this.values = this.options.series.map(() => h("b", {}));
+    /** @type {HTMLElement} */
     this.at = h("span", { class: "chart-at" });
     this.legend.replaceChildren(...this.options.series.map((one, index) =>
       h("span", { class: "chart-name" }, many && h("span", { class: `chart-key${one.kind === "band" ? " band" : ""}`, style: { background: this.colourOf(one, index) } }), one.name ?? "", " ", this.values[index])), this.at);
   }
 
+  /**
+   * @param {Series} one
+   * @param {number} index
+   */
   colourOf(one, index) { return this.colour(one.color ?? index + 1); }
 
   listen() {
@@ -100,8 +147,8 @@ class LineChart extends Chart {
   }
 
   drop() {
-    if (!this.drag) return;
-    const [from, to] = this.drag.map((px) => this.toX(px));
+    if (!this.drag || !this.toX) return;
+    const [from, to] = [this.toX(this.drag[0]), this.toX(this.drag[1])];
     const moved = Math.abs(this.drag[1] - this.drag[0]) > DRAG_PX;
     this.drag = null;
     if (moved) this.chooseView([Math.min(from, to), Math.max(from, to)]);
@@ -109,14 +156,16 @@ class LineChart extends Chart {
     this.draw();
   }
 
+  /** @param {KeyboardEvent} event */
   key(event) {
-    const longest = this.options.series.reduce((best, one) => (one.x.length > best.length ? one.x : best), []);
+    const longest = this.options.series.reduce((best, one) => (one.x.length > best.length ? one.x : best), /** @type {ArrayLike<number>} */ ([]));
     if (!longest.length || !this.bounds) return;
     const [x0, x1] = this.bounds;
     const index = this.pointer === null ? firstNotBelow(longest, x0) : nearest(longest, this.pointer);
     const to = (i) => this.point(longest[Math.max(0, Math.min(longest.length - 1, i))]);
     const middle = this.pointer ?? (x0 + x1) / 2;
     const around = (factor) => this.chooseView([middle - (middle - x0) * factor, middle + (x1 - middle) * factor]);
+    /** @type {Record<string, () => void>} */
     const actions = {
       ArrowLeft: () => to(index - 1), ArrowRight: () => to(this.pointer === null ? index : index + 1),
       Home: () => to(0), End: () => to(longest.length - 1),
@@ -128,22 +177,28 @@ class LineChart extends Chart {
     actions[event.key]();
   }
 
-  peers() { return groups.get(this.options.group) ?? [this]; }
+  peers() { return groups.get(this.options.group ?? "") ?? [this]; }
 
+  /** @param {number | null} x */
   point(x) {
     for (const chart of this.peers()) { chart.pointer = x; chart.draw(); }
   }
 
+  /** @param {Range | null} range */
   chooseView(range) {
     const all = this.extent();
-    let view = range && [Math.max(range[0], all[0]), Math.min(range[1], all[1])];
+    let view = range && /** @type {Range} */ ([Math.max(range[0], all[0]), Math.min(range[1], all[1])]);
     if (view && (view[1] - view[0] >= all[1] - all[0] || !(view[1] > view[0]))) view = null;
     for (const chart of this.peers()) chart.zoom(view);
     this.options.onRange?.(view);
   }
 
-  /** The x range of the data, or as the options fix it. */
+  /**
+   * The x range of the data, or as the options fix it.
+   * @returns {Range}
+   */
   extent() {
+    /** @type {Range} */
     const range = [Infinity, -Infinity];
     for (const one of this.options.series) if (one.x.length) extend(range, [one.x[0], one.x[one.x.length - 1]]);
     const [low, high] = this.options.xRange ?? [];
@@ -152,12 +207,18 @@ class LineChart extends Chart {
     return [low ?? wide[0], high ?? wide[1]];
   }
 
-  /** The y range of one axis over the x that is seen. */
+  /**
+   * The y range of one axis over the x that is seen.
+   * @param {boolean} right
+   * @param {Range} seen
+   * @returns {Range}
+   */
   rangeY(right, [x0, x1]) {
+    /** @type {Range} */
     const range = [Infinity, -Infinity];
     for (const one of this.options.series.filter((s) => Boolean(s.right) === right)) {
       const start = Math.max(0, firstNotBelow(one.x, x0) - 1), stop = firstNotBelow(one.x, x1) + 1;
-      for (const values of [one.y, one.low, one.high]) if (values) extend(range, values.slice(start, stop));
+      for (const values of [one.y, one.low, one.high]) if (values) extend(range, Array.prototype.slice.call(values, start, stop));
     }
     const fixed = (right ? this.options.rightRange : this.options.yRange) ?? [];
     const fitted = padded(range);
@@ -168,26 +229,34 @@ class LineChart extends Chart {
   paint() {
     const found = this.begin();
     if (!found) return;
-    const { pen, width, height, ink } = found, { options } = this;
-    this.bounds = this.view ?? this.extent();
+    const { pen, width, height, ink } = found, { options } = this, bounds = this.view ?? this.extent();
+    /** @type {Range | undefined} */
+    this.bounds = bounds;
     const hasData = options.series.some((one) => one.y.length);
     const hasRight = options.series.some((one) => one.right);
-    const axes = [false, ...(hasRight ? [true] : [])].map((right) => axisOf(pen, this.rangeY(right, this.bounds), height));
+    const axes = [false, ...(hasRight ? [true] : [])].map((right) => axisOf(pen, this.rangeY(right, bounds), height));
     const top = options.yLabel || options.rightLabel || options.markers.length ? 24 : 10;
-    const box = boxOf(axes, width, height, top), place = axes.map((axis) => places(box, this.bounds, axis.range));
+    const box = boxOf(axes, width, height, top), place = axes.map((axis) => places(box, bounds, axis.range));
+    /** @type {((px: number) => number) | undefined} */
     this.toX = place[0].toX;
-    if (hasData) paintAxes(pen, box, axes, this.bounds, ink, options, width, height);
+    if (hasData) paintAxes(pen, box, axes, bounds, ink, options, width, height);
     clip(pen, box);
     if (hasData) this.paintLevels(pen, box, place[0], ink);
-    options.series.forEach((one, index) => paintSeries(pen, one, this.colourOf(one, index), this.bounds, place[one.right ? 1 : 0], box));
+    options.series.forEach((one, index) => paintSeries(pen, one, this.colourOf(one, index), bounds, place[one.right ? 1 : 0], box));
     if (this.drag) this.paintDrag(pen, ink, this.drag[0], box.top, this.drag[1], box.bottom);
     pen.restore();
-    this.paintMarkers(pen, box, place[0], ink);
-    if (hasData) this.paintPointer(pen, box, place, ink);
+    this.paintMarkers(pen, box, bounds, place[0], ink);
+    if (hasData) this.paintPointer(pen, box, bounds, place, ink);
     else this.paintEmpty(pen, box, ink);
     this.speak(hasData ? this.summary() : options.empty);
   }
 
+  /**
+   * @param {CanvasRenderingContext2D} pen
+   * @param {Inside} box
+   * @param {Places} place
+   * @param {Ink} ink
+   */
   paintLevels(pen, box, place, ink) {
     pen.setLineDash([5, 4]);
     pen.strokeStyle = ink.text;
@@ -195,10 +264,17 @@ class LineChart extends Chart {
     pen.setLineDash([]);
   }
 
-  paintMarkers(pen, box, place, ink) {
+  /**
+   * @param {CanvasRenderingContext2D} pen
+   * @param {Inside} box
+   * @param {Range} bounds
+   * @param {Places} place
+   * @param {Ink} ink
+   */
+  paintMarkers(pen, box, bounds, place, ink) {
     pen.setLineDash([3, 3]);
     for (const { x, label } of this.options.markers) {
-      if (x < this.bounds[0] || x > this.bounds[1]) continue;
+      if (x < bounds[0] || x > bounds[1]) continue;
       const at = Math.round(place.x(x)) + 0.5;
       pen.strokeStyle = ink.text;
       stroke(pen, at, box.top, at, box.bottom);
@@ -210,20 +286,25 @@ class LineChart extends Chart {
     pen.setLineDash([]);
   }
 
-  paintPointer(pen, box, place, ink) {
-    const { series, formatX } = this.options;
-    const shown = this.pointer !== null && this.pointer >= this.bounds[0] && this.pointer <= this.bounds[1];
-    let at = null;
-    series.forEach((one, index) => {
-      const found = shown ? valueAt(one, this.pointer) : null;
-      const known = found && found.y !== null && Number.isFinite(found.y);
-      setText(this.values[index], known ? this.valueText(one, found) : "");
-      if (!known) return;
+  /**
+   * @param {CanvasRenderingContext2D} pen
+   * @param {Inside} box
+   * @param {Range} bounds
+   * @param {Places[]} place
+   * @param {Ink} ink
+   */
+  paintPointer(pen, box, bounds, place, ink) {
+    const { series, formatX } = this.options, { pointer } = this;
+    let at = /** @type {Found | null} */ (null);
+    for (const [index, one] of series.entries()) {
+      const found = pointer !== null && pointer >= bounds[0] && pointer <= bounds[1] ? valueAt(one, pointer) : null;
+      if (!found || found.y === null || !Number.isFinite(found.y)) { setText(this.values[index], ""); continue; }
+      setText(this.values[index], this.valueText(one, found));
       at ??= found;
-      if (one.kind === "bars" || one.kind === "band") return;
+      if (one.kind === "bars" || one.kind === "band") continue;
       const own = place[one.right ? 1 : 0];
       dot(pen, own.x(found.x), own.y(found.y), 3.5, this.colourOf(one, index), ink.panel);
-    });
+    }
     setText(this.at, at ? `at ${at.text ?? formatX(at.x)}` : "");
     if (!at) return;
     pen.strokeStyle = ink.text;
@@ -233,8 +314,12 @@ class LineChart extends Chart {
     pen.globalAlpha = 1;
   }
 
+  /**
+   * @param {Series} one
+   * @param {Found} found
+   */
   valueText(one, { y, low, high }) {
-    const { formatY } = this.options;
+    const formatY = /** @type {(value: unknown) => string} */ (this.options.formatY);
     return `${one.kind === "band" ? `${formatY(low)} to ${formatY(high)}` : formatY(y)}${one.unit ? ` ${one.unit}` : ""}`;
   }
 
@@ -248,6 +333,11 @@ class LineChart extends Chart {
   }
 }
 
+/**
+ * @param {Series} one
+ * @param {number} x
+ * @returns {Found | null}
+ */
 function valueAt(one, x) {
   if (!one.y.length) return null;
   if (one.kind !== "bars") {

@@ -22,7 +22,7 @@ export function significant(value, digits = 3) {
 /** A rate with k and M: 1.24M, 36.1k, 480, 3.2. */
 export function rate(value) {
   if (!finite(value)) return "–";
-  const [scale, letter] = value >= 999.5e3 ? [1e6, "M"] : value >= 9995 ? [1e3, "k"] : [1, ""];
+  const [scale, letter] = /** @type {[number, string]} */ (value >= 999.5e3 ? [1e6, "M"] : value >= 9995 ? [1e3, "k"] : [1, ""]);
   const scaled = value / scale;
   if (scaled >= 999.5) return whole.format(scaled);
   return scaled.toFixed(scaled >= 99.95 ? 0 : scaled >= 9.995 ? 1 : 2).replace(/^0\.00$/, "0") + letter;
@@ -53,7 +53,7 @@ export function duration(seconds) {
   if (seconds < 0.995) return `${significant(Math.max(seconds, 0), 2)} s`;
   if (seconds < 9.95) return `${seconds.toFixed(1)} s`;
   const total = Math.round(seconds);
-  const parts = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]];
+  const parts = /** @type {[number, string][]} */ ([[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]]);
   const first = parts.findIndex(([size]) => total >= size);
   let rest = total;
   return parts.slice(first, first + 2).map(([size, unit]) => {
@@ -89,8 +89,11 @@ export const timeOfDay = (iso) => (iso ? clockWithSeconds.format(new Date(iso)) 
 /** The whole local date and time, for titles. */
 export const fullTime = (iso) => (iso ? full.format(new Date(iso)) : "");
 
-/** Seconds between two ISO times; without the second, until now. */
-export const between = (start, stop = null) => ((stop ? new Date(stop) : new Date()) - new Date(start)) / 1000;
+/**
+ * Seconds between two ISO times; without the second, until now.
+ * @type {(start: string, stop?: string | null) => number}
+ */
+export const between = (start, stop = null) => ((stop ? new Date(stop) : new Date()).getTime() - new Date(start).getTime()) / 1000;
 
 /** A state of a job in words. */
 export const STATES = {
@@ -122,4 +125,5 @@ export const STAGES = {
 /** The name of a job: its label, else its file's name. */
 export const nameOf = (job) => job.label || job.source.split("/").pop() || job.id;
 
+/** @type {(value: unknown) => value is number} */
 function finite(value) { return typeof value === "number" && Number.isFinite(value); }

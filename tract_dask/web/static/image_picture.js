@@ -1,18 +1,32 @@
 // A picture of a part of an image: loaded, cancelled where it is no longer wanted, and drawn where it belongs.
 
+/**
+ * @import { Box, ImageView } from "./image_view.js"
+ * @typedef {{ box: Box, level: number }} Part
+ */
+
 const CRISP = 2; // device px a pixel, from which on pixels are drawn as squares
 
 /** One picture of a box of the image: the newest that has come, and at most one more on its way. */
 export class Picture {
+  /** @param {ImageView} view */
   constructor(view) {
     this.view = view;
-    this.clear();
+    /** @type {Part | null} */
+    this.shown = null;
+    /** @type {Part | null} */
+    this.wanted = null;
+    /** @type {AbortController | null} */
+    this.request = null;
+    /** @type {ImageBitmap | null} */
+    this.bitmap = null;
+    this.stale = false;
   }
 
   clear() {
     this.request?.abort();
     this.bitmap?.close();
-    this.shown = this.wanted = this.request = this.bitmap = null; // shown, wanted: {box, level}
+    this.shown = this.wanted = this.request = this.bitmap = null;
     this.stale = false;
   }
 
@@ -20,17 +34,25 @@ export class Picture {
     return this.request !== null;
   }
 
-  /** Show a bitmap that is there already. */
+  /**
+   * Show a bitmap that is there already.
+   * @param {ImageBitmap} bitmap
+   * @param {Box} box
+   */
   put(bitmap, box) {
     this.bitmap = bitmap;
     this.shown = this.wanted = { box, level: 1 };
     this.stale = false;
   }
 
+  /**
+   * @param {Box} box
+   * @param {number} level
+   */
   covers(box, level) {
     const mine = this.wanted;
     return (
-      !this.stale && mine?.level === level &&
+      !this.stale && mine !== null && mine.level === level &&
       mine.box.x0 <= box.x0 && mine.box.y0 <= box.y0 && mine.box.x1 >= box.x1 && mine.box.y1 >= box.y1
     );
   }
@@ -38,26 +60,30 @@ export class Picture {
   /**
    * Load a box, unless it is there or on its way. A request for another box is cancelled; one for the same box, whose
    * picture is to change, may arrive first, so that something moves while a slider is drawn.
+   * @param {Box} box
+   * @param {number} level
    */
   ask(box, level) {
-    const same = this.wanted?.level === level && Object.keys(box).every((side) => this.wanted.box[side] === box[side]);
+    const before = this.wanted;
+    const same = before?.level === level && Object.keys(box).every((side) => before.box[side] === box[side]);
     if (same && !this.stale) return;
     if (same && this.loading) return; // it begins again when that has come
     this.request?.abort();
-    this.wanted = { box, level };
-    this.#fetch();
+    this.#fetch(this.wanted = { box, level });
   }
 
-  async #fetch() {
-    const { wanted, view } = this;
+  /** @param {Part} wanted */
+  async #fetch(wanted) {
+    const { view } = this, { url } = view.options;
+    if (!url) return;
     const request = (this.request = new AbortController());
     this.stale = false;
-    let bitmap = null;
+    let bitmap = /** @type {ImageBitmap | null} */ (null);
     try {
       const { box, level } = wanted;
       const [w, h] = [Math.ceil((box.x1 - box.x0) / level), Math.ceil((box.y1 - box.y0) / level)];
       const edges = { x0: box.x0 - 0.5, y0: box.y0 - 0.5, x1: box.x1 - 0.5, y1: box.y1 - 0.5 };
-      const answer = await fetch(view.options.url(edges, w, h), { signal: request.signal });
+      const answer = await fetch(url(edges, w, h), { signal: request.signal });
       if (!answer.ok) throw new Error(`The picture could not be loaded (${answer.status} ${answer.statusText}).`);
       bitmap = await createImageBitmap(await answer.blob());
     } catch (error) {
@@ -75,12 +101,12 @@ export class Picture {
       this.shown = wanted;
       view.options.onPicture?.(view);
     }
-    if (this.stale) this.#fetch();
+    if (this.stale) this.#fetch(wanted);
     view.redraw();
   }
 
   draw(context) {
-    if (!this.bitmap) return;
+    if (!this.bitmap || !this.shown) return;
     const { box } = this.shown;
     const { view } = this;
     const low = view.toScreen(box.x0 - 0.5, box.y0 - 0.5);

@@ -23,8 +23,27 @@
  *   view.redraw(); view.fit(); view.zoom(factor, screenPoint); view.center(x, y, scale); view.close()
  *   view.toScreen(x, y) -> {x, y} CSS px in the element; view.toImage(sx, sy) -> {x, y}; view.scale (CSS px a pixel)
  *   view.visible() -> {x0, y0, x1, y1} coordinates; view.loaded (whether what is shown is what is wanted)
+ *
+ * @typedef {{ x: number, y: number }} Point
+ * @typedef {{ x: number, y: number, sx: number, sy: number }} Pointed a place in the image, and in the element
+ * @typedef {{ x0: number, y0: number, x1: number, y1: number }} Box
+ * @typedef {{ width: number, height: number, pixelSizePm?: number | null }} Image
+ * @typedef {{ bitmap: ImageBitmap, width: number, height: number }} WholePicture
+ * @typedef {{ move?: (point: Pointed, event: PointerEvent) => void, end?: (point: Pointed, event: PointerEvent) => void, cancel?: () => void }} Gesture
+ * @typedef {object} Behaviour
+ * @property {(box: Box, w: number, h: number) => string} [url]
+ * @property {WholePicture} [picture]
+ * @property {(pen: CanvasRenderingContext2D, view: ImageView) => void} [onDraw]
+ * @property {(point: Pointed | null, event: PointerEvent) => void} [onHover]
+ * @property {(view: ImageView) => void} [onView]
+ * @property {(error: Error) => void} [onError]
+ * @property {(view: ImageView) => void} [onPicture]
+ * @property {(point: Pointed, event: PointerEvent) => Gesture | null | undefined} [gesture]
+ * @property {(point: Pointed, event: MouseEvent) => boolean} [onDoubleClick]
+ * @typedef {Image & Behaviour} ImageOptions
  */
 
+import { penOf } from "./dom.js";
 import { Picture } from "./image_picture.js";
 import { drawScaleBar } from "./scale_bar.js";
 
@@ -35,27 +54,44 @@ const FINEST = 64; // CSS px a pixel
 const WAIT_MS = 70; // after a movement, before a sharper picture is asked for
 
 export class ImageView {
+  /**
+   * @param {HTMLElement} element
+   * @param {ImageOptions} options
+   */
   constructor(element, options) {
     this.element = element;
     this.options = options;
-    this.scale = 1;
+    this.width = this.height = 0;
+    /** @type {number | null} */
+    this.pixelSizePm = null;
+    this.scale = this.ratio = 1;
     this.fitted = true;
     this.middle = { x: 0, y: 0 };
     this.size = { width: 0, height: 0 };
     this.whole = new Picture(this);
     this.detail = new Picture(this);
+    /** @type {Map<number, Pointed>} */
     this.pointers = new Map();
+    /** @type {Gesture | null} */
     this.drag = null;
+    this.frame = this.waiting = 0; // of what is to be drawn, and loaded
     this.stopping = new AbortController();
-    this.#build();
+    this.#dress();
+    this.canvas = this.#layer("picture");
+    this.overlay = this.#layer("overlay");
+    this.watcher = new ResizeObserver(() => this.#sized());
+    this.themes = new MutationObserver(() => this.redraw());
     this.#listen();
     this.setImage(options);
   }
 
-  /** Show another image, or the same at another size. */
+  /**
+   * Show another image, or the same at another size.
+   * @param {Image} image
+   */
   setImage({ width, height, pixelSizePm = this.pixelSizePm }) {
     const same = width === this.width && height === this.height;
-    Object.assign(this, { width, height, pixelSizePm: pixelSizePm ?? null });
+    [this.width, this.height, this.pixelSizePm] = [width, height, pixelSizePm ?? null];
     if (!same) {
       this.whole.clear();
       this.detail.clear();
@@ -132,8 +168,8 @@ export class ImageView {
 
   /** Draw in the next animation frame. */
   redraw() {
-    this.frame ??= requestAnimationFrame(() => {
-      this.frame = null;
+    this.frame ||= requestAnimationFrame(() => {
+      this.frame = 0;
       this.draw();
     });
   }
@@ -151,20 +187,21 @@ export class ImageView {
     this.overlay.remove();
   }
 
-  #build() {
+  #dress() {
     const { style } = this.element;
     if (getComputedStyle(this.element).position === "static") style.position = "relative";
     style.overflow = "hidden";
     style.touchAction = "none";
     style.userSelect = "none";
     if (!this.element.hasAttribute("tabindex")) this.element.tabIndex = 0;
-    [this.canvas, this.overlay] = ["picture", "overlay"].map((name) => {
-      const canvas = document.createElement("canvas");
-      canvas.className = name;
-      canvas.setAttribute("aria-hidden", "true");
-      Object.assign(canvas.style, { position: "absolute", inset: "0", width: "100%", height: "100%", pointerEvents: "none" });
-      return this.element.appendChild(canvas);
-    });
+  }
+
+  #layer(name) {
+    const canvas = document.createElement("canvas");
+    canvas.className = name;
+    canvas.setAttribute("aria-hidden", "true");
+    Object.assign(canvas.style, { position: "absolute", inset: "0", width: "100%", height: "100%", pointerEvents: "none" });
+    return this.element.appendChild(canvas);
   }
 
   #listen() {
@@ -178,15 +215,15 @@ export class ImageView {
     on("pointerleave", (event) => this.options.onHover?.(null, event));
     on("dblclick", (event) => this.options.onDoubleClick?.(this.#point(event), event) || this.fit());
     on("keydown", (event) => this.#onKey(event));
-    this.watcher = new ResizeObserver(() => {
-      this.#resize();
-      if (this.fitted) this.fit();
-      else this.#moved();
-    });
     this.watcher.observe(this.element);
-    this.themes = new MutationObserver(() => this.redraw());
     this.themes.observe(document.documentElement, { attributes: true, attributeFilter: ["data-theme", "class"] });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw(), { signal });
+  }
+
+  #sized() {
+    this.#resize();
+    if (this.fitted) this.fit();
+    else this.#moved();
   }
 
   #fitting() {
@@ -210,7 +247,7 @@ export class ImageView {
     this.options.onView?.(this);
     clearTimeout(this.waiting);
     this.waiting = setTimeout(() => {
-      this.waiting = null;
+      this.waiting = 0;
       this.#load();
     }, WAIT_MS);
   }
@@ -267,7 +304,7 @@ export class ImageView {
 
   #pinch(id, point) {
     const [other] = [...this.pointers].filter(([pointer]) => pointer !== id).map(([, place]) => place);
-    const before = this.pointers.get(id);
+    const before = this.pointers.get(id) ?? point;
     const apart = (place) => Math.max(8, Math.hypot(place.sx - other.sx, place.sy - other.sy));
     this.pan((point.sx - before.sx) / 2, (point.sy - before.sy) / 2);
     this.zoom(apart(point) / apart(before), { x: (point.sx + other.sx) / 2, y: (point.sy + other.sy) / 2 });
@@ -333,11 +370,11 @@ export class ImageView {
 
   /** Draw now; `redraw` does it once a frame. */
   draw() {
-    const context = this.canvas.getContext("2d");
+    const context = penOf(this.canvas);
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, this.canvas.width, this.canvas.height);
     for (const picture of [this.whole, this.detail]) picture.draw(context);
-    const overlay = this.overlay.getContext("2d");
+    const overlay = penOf(this.overlay);
     overlay.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     overlay.clearRect(0, 0, this.size.width, this.size.height);
     this.#outline(overlay);

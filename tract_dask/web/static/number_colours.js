@@ -1,7 +1,16 @@
 // Colours for numbers: viridis, which is even to the eye, also to those who do not see red and green apart.
 
 import { tickText, ticks } from "./chart_scale.js";
+import { penOf } from "./dom.js";
 import { theme } from "./theme_colours.js";
+
+/**
+ * @typedef {object} Scale
+ * @property {number} low
+ * @property {number} high
+ * @property {boolean} more whether some values lie above
+ * @property {(value: number) => string} colour
+ */
 
 const VIRIDIS = [
   [68, 1, 84], [72, 26, 108], [71, 47, 125], [65, 68, 135], [57, 86, 140], [49, 104, 142], [42, 120, 142], [35, 136, 142],
@@ -9,7 +18,10 @@ const VIRIDIS = [
 ];
 const HIGHEST = 0.95; // share of the columns that the scale covers: one that is far off shall not make all others alike
 
-/** The colour of a share 0 to 1 of the scale. */
+/**
+ * The colour of a share 0 to 1 of the scale.
+ * @param {number} share
+ */
 export function viridis(share) {
   const place = Math.min(1, Math.max(0, share)) * (VIRIDIS.length - 1);
   const low = Math.min(VIRIDIS.length - 2, Math.floor(place)), part = place - low;
@@ -17,9 +29,13 @@ export function viridis(share) {
   return `rgb(${r} ${g} ${b})`;
 }
 
-/** A scale for these values: { low, high, more (whether some lie above), colour(value) }; null without values. */
+/**
+ * A scale for these values; null without values.
+ * @param {(number | null | undefined)[]} values
+ * @returns {Scale | null}
+ */
 export function scaleOf(values) {
-  const known = values.filter((value) => Number.isFinite(value) && value !== null).sort((a, b) => a - b);
+  const known = values.filter((value) => typeof value === "number").filter(Number.isFinite).sort((a, b) => a - b);
   if (!known.length) return null;
   const low = known[0], last = known[known.length - 1];
   const high = known[Math.min(known.length - 1, Math.ceil(HIGHEST * (known.length - 1)))];
@@ -27,13 +43,18 @@ export function scaleOf(values) {
   return { low, high, more: last > high, colour: (value) => viridis(width > 0 ? (value - low) / width : 0.5) };
 }
 
-/** Draw the scale as an upright bar with its label and ticks. */
+/**
+ * Draw the scale as an upright bar with its label and ticks.
+ * @param {HTMLCanvasElement} canvas
+ * @param {Scale | null} scale
+ * @param {string} label
+ */
 export function drawColourBar(canvas, scale, label) {
   const ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = Math.round(width * ratio);
   canvas.height = Math.round(height * ratio);
   canvas.setAttribute("aria-label", scale ? `Colours: ${label} from ${scale.low} to ${scale.high}` : "");
-  const pen = canvas.getContext("2d");
+  const pen = penOf(canvas);
   pen.scale(ratio, ratio);
   if (!scale || height < 80) return;
   const [top, bottom, wide] = [scale.more ? 54 : 34, height - 10, 14];

@@ -1,12 +1,18 @@
 // The scale bar of an image.
 
-/** A bar of a round length of about a sixth of the width: nm, pm where that is less than a tenth of one, else px. */
+/** @import { ImageView } from "./image_view.js" */
+
+/**
+ * A bar of a round length of about a sixth of the width: nm, pm where that is less than a tenth of one, else px.
+ * @param {CanvasRenderingContext2D} context
+ * @param {ImageView} view
+ */
 export function drawScaleBar(context, view) {
   const { pixelSizePm, size } = view;
   const perUnit = pixelSizePm ? (1000 * view.scale) / pixelSizePm : view.scale; // CSS px a nm, or a px
   const target = Math.min(160, Math.max(50, size.width / 6)) / perUnit;
   const power = 10 ** Math.floor(Math.log10(target));
-  const length = [5, 2, 1].map((digit) => digit * power).find((value) => value <= target * 1.0001);
+  const length = ([5, 2, 1].find((digit) => digit * power <= target * 1.0001) ?? 1) * power;
   const text = !pixelSizePm ? `${number(length)} px` : length < 0.1 ? `${number(1000 * length)} pm` : `${number(length)} nm`;
   const wide = length * perUnit;
   context.save();

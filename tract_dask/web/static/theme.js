@@ -27,5 +27,5 @@
   apply();
   system.addEventListener("change", apply);
   addEventListener("storage", (event) => { if (event.key === KEY) apply(); });
-  document.addEventListener("click", (event) => { if (event.target.closest("[data-theme-toggle]")) toggle(); });
+  document.addEventListener("click", (event) => { if (event.target instanceof Element && event.target.closest("[data-theme-toggle]")) toggle(); });
 })();

@@ -1,8 +1,13 @@
 // Which counts are black and which are white: two handles under a histogram.
 
-import { h, setText } from "./dom.js";
+import { h, penOf, setText } from "./dom.js";
 import { significant } from "./format.js";
 import { theme } from "./theme_colours.js";
+
+/**
+ * @import { Levels } from "./api.js"
+ * @typedef {[number, number]} Span
+ */
 
 const STEPS = 1000;
 
@@ -16,8 +21,12 @@ const STEPS = 1000;
 export class Contrast {
   constructor(element, { onChange }) {
     this.onChange = onChange;
+    /** @type {Levels | null} */
     this.levels = null;
-    this.chosen = null; // [low, high]
+    /** @type {Span | null} */
+    this.chosen = null; // black and white
+    /** @type {Span | null} */
+    this.span = null; // of the handles
     this.canvas = h("canvas", { "aria-hidden": "true" });
     const slider = (kind, label) => h("input", { type: "range", class: kind, min: 0, max: STEPS, value: kind === "lower" ? 0 : STEPS, "aria-label": label, oninput: () => this.moved(kind) });
     this.sliders = [slider("lower", "Black: counts"), slider("upper", "White: counts")];
@@ -32,60 +41,63 @@ export class Contrast {
   /** Low and high in counts; null before there are levels. */
   get value() { return this.chosen; }
 
-  /** Take the values of another picture; black and white stay, unless there are none yet. */
+  /**
+   * Take the values of another picture; black and white stay, unless there are none yet.
+   * @param {Levels} levels
+   */
   setLevels(levels) {
     this.levels = levels;
-    if (!levels.range) return;
-    if (!this.chosen) this.chosen = this.suitable();
-    this.span = [Math.min(levels.range[0], this.chosen[0]), Math.max(levels.range[1], this.chosen[1])];
+    const { range } = levels;
+    if (!range) return;
+    const chosen = this.chosen ??= suitable(levels, range);
+    this.span = [Math.min(range[0], chosen[0]), Math.max(range[1], chosen[1])];
     if (this.span[0] === this.span[1]) this.span[1] += 1;
-    this.show();
+    this.show(chosen, this.span);
   }
 
   /** Fit black and white to the picture that is shown. */
   auto() {
-    if (!this.levels?.range) return;
-    this.chosen = this.suitable();
-    this.setLevels(this.levels);
-    this.onChange(...this.chosen);
+    const { levels } = this;
+    if (!levels?.range) return;
+    const chosen = this.chosen = suitable(levels, levels.range);
+    this.setLevels(levels);
+    this.onChange(...chosen);
   }
 
-  suitable() {
-    const { percentiles, range } = this.levels;
-    const [low, high] = [percentiles["0.5"], percentiles["99.5"]];
-    return high > low ? [low, high] : range[1] > range[0] ? [...range] : [range[0], range[0] + 1];
-  }
-
+  /** @param {string} kind "lower" or "upper" */
   moved(kind) {
     if (!this.span) return;
     const [low, high] = this.span, least = (high - low) / STEPS;
-    const values = this.sliders.map((slider) => low + (slider.value / STEPS) * (high - low));
+    const values = /** @type {Span} */ (this.sliders.map((slider) => low + (Number(slider.value) / STEPS) * (high - low)));
     if (values[1] - values[0] < least) {
       if (kind === "lower") values[0] = Math.max(low, values[1] - least); else values[1] = values[0] + least;
     }
     this.chosen = values;
-    this.show();
+    this.show(values, this.span);
     this.onChange(...values);
   }
 
-  show() {
-    const [low, high] = this.span;
+  /**
+   * @param {Span} chosen
+   * @param {Span} span
+   */
+  show(chosen, [low, high]) {
     this.sliders.forEach((slider, index) => {
-      slider.value = Math.round(((this.chosen[index] - low) / (high - low)) * STEPS);
-      slider.setAttribute("aria-valuetext", `${significant(this.chosen[index], 3)} counts`);
+      slider.value = String(Math.round(((chosen[index] - low) / (high - low)) * STEPS));
+      slider.setAttribute("aria-valuetext", `${significant(chosen[index], 3)} counts`);
     });
-    setText(this.ends, `${significant(this.chosen[0], 3)} to ${significant(this.chosen[1], 3)} counts`);
+    setText(this.ends, `${significant(chosen[0], 3)} to ${significant(chosen[1], 3)} counts`);
     this.draw();
   }
 
   draw() {
-    const { canvas, levels, span } = this;
-    if (!span || !canvas.clientWidth) return;
+    const { canvas, levels, span, chosen } = this;
+    if (!span || !levels || !chosen || !canvas.clientWidth) return;
     const ratio = devicePixelRatio || 1, [width, height] = [canvas.clientWidth, canvas.clientHeight];
     Object.assign(canvas, { width: width * ratio, height: height * ratio });
-    const pen = canvas.getContext("2d");
+    const pen = penOf(canvas);
     pen.scale(ratio, ratio);
-    const x = (value) => ((value - span[0]) / (span[1] - span[0])) * width;
+    const x = (/** @type {number} */ value) => ((value - span[0]) / (span[1] - span[0])) * width;
     pen.fillStyle = theme.color("--edge");
     const most = Math.sqrt(Math.max(...levels.counts, 1)); // by the root, or the tail would not be seen
     levels.counts.forEach((number, index) => {
@@ -94,10 +106,21 @@ export class Contrast {
     });
     pen.fillStyle = theme.color("--panel");
     pen.globalAlpha = 0.6;
-    pen.fillRect(0, 0, x(this.chosen[0]), height);
-    pen.fillRect(x(this.chosen[1]), 0, width - x(this.chosen[1]), height);
+    pen.fillRect(0, 0, x(chosen[0]), height);
+    pen.fillRect(x(chosen[1]), 0, width - x(chosen[1]), height);
     pen.globalAlpha = 1;
     pen.fillStyle = theme.color("--accent");
-    for (const value of this.chosen) pen.fillRect(Math.min(Math.max(x(value) - 0.75, 0), width - 1.5), 0, 1.5, height);
+    for (const value of chosen) pen.fillRect(Math.min(Math.max(x(value) - 0.75, 0), width - 1.5), 0, 1.5, height);
   }
+}
+
+/**
+ * Black and white as suit a picture.
+ * @param {Levels} levels
+ * @param {Span} range of its values
+ * @returns {Span}
+ */
+function suitable({ percentiles }, range) {
+  const [low, high] = [percentiles?.["0.5"] ?? NaN, percentiles?.["99.5"] ?? NaN];
+  return high > low ? [low, high] : range[1] > range[0] ? [...range] : [range[0], range[0] + 1];
 }

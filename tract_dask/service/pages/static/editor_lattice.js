@@ -1,9 +1,24 @@
 // A lattice from three atoms: clicked, adjusted by their handles and by counts, seen before it is added.
 
 import { toast } from "./api.js";
-import { setText } from "./dom.js";
+import { find, setText } from "./dom.js";
 import { several } from "./format.js";
 import { paintLattice } from "./editor_paint.js";
+
+/**
+ * @import { Editor } from "./editor.js"
+ * @import { ImageView, Point } from "./image_view.js"
+ * @typedef {Point & { known: boolean }} Site that is a column already, or not
+ * @typedef {{ a_count: number, b_count: number, a_before: number, a_after: number, b_before: number, b_after: number }} Counts
+ * @typedef {object} Sites
+ * @property {Counts} values
+ * @property {number} spacing
+ * @property {Site[]} places
+ * @property {number} outside
+ * @property {number} known
+ * @property {number} total
+ * @property {number} fresh
+ */
 
 const SAME = 1 / 3; // a site within this share of the spacing of a column is that column
 const MOST_SITES = 1_000_000;
@@ -18,13 +33,21 @@ const COUNTS = ["a_count", "b_count"];
 const RANGES = ["a_before", "a_after", "b_before", "b_after"];
 
 export class LatticeTool {
+  /**
+   * @param {Editor} editor
+   * @param {HTMLElement} panel
+   */
   constructor(editor, panel) {
     this.editor = editor;
     this.panel = panel;
-    this.handles = [];
-    this.fields = Object.fromEntries([...COUNTS, ...RANGES, "kind"].map((name) => [name, panel.querySelector(`[name=${name}]`)]));
+    /** @type {Point[]} */
+    this.handles = []; // the three atoms, as far as they are clicked
+    this.touched = [true, false, false]; // whether the user has said how many columns they are apart
+    /** @type {Sites | { problem: string } | null} */
+    this.sites = null;
+    this.fields = Object.fromEntries([...COUNTS, ...RANGES, "kind"].map((name) => [name, find(`[name=${name}]`, HTMLInputElement, panel)]));
     panel.addEventListener("input", (event) => {
-      const axis = "0ab".indexOf(event.target.name[0]);
+      const axis = event.target instanceof HTMLInputElement ? "0ab".indexOf(event.target.name[0]) : -1;
       if (axis > 0) this.touched[axis] = true; // what the user has said is not guessed again
       this.changed();
     });
@@ -32,8 +55,8 @@ export class LatticeTool {
       event.preventDefault();
       this.add();
     });
-    panel.querySelector("[data-do=fill]").onclick = () => this.fill();
-    panel.querySelector("[data-do=restart]").onclick = () => this.restart();
+    find("[data-do=fill]", HTMLButtonElement, panel).onclick = () => this.fill();
+    find("[data-do=restart]", HTMLButtonElement, panel).onclick = () => this.restart();
     this.restart();
   }
 
@@ -52,13 +75,18 @@ export class LatticeTool {
     return true;
   }
 
+  /** @param {Point} point */
   handleAt({ x, y }) {
     const reach = GRAB_PX / this.editor.view.scale;
     const found = this.handles.findLastIndex((handle) => Math.hypot(handle.x - x, handle.y - y) <= reach);
     return found < 0 ? null : found;
   }
 
-  /** The next atom is here, or at the column or maximum nearby. */
+  /**
+   * The next atom is here, or at the column or maximum nearby.
+   * @param {Point} point
+   * @param {boolean} exactly
+   */
   async click(point, exactly) {
     const index = this.handles.length;
     if (index === 3) return;
@@ -68,15 +96,27 @@ export class LatticeTool {
     await this.snap(index, exactly);
   }
 
+  /**
+   * @param {number} index
+   * @param {Point} point
+   */
   drag(index, { x, y }) {
     this.handles[index] = { x, y };
     this.changed();
   }
 
+  /**
+   * @param {number} index
+   * @param {boolean} exactly
+   */
   async drop(index, exactly) {
     await this.snap(index, exactly);
   }
 
+  /**
+   * @param {number} index
+   * @param {boolean} exactly
+   */
   async snap(index, exactly) {
     const placed = this.handles[index];
     const found = exactly ? null : await this.editor.nearby(placed);
@@ -86,7 +126,10 @@ export class LatticeTool {
     this.changed();
   }
 
-  /** Columns from the origin to an atom: those that are on the line, else by the spacing. */
+  /**
+   * Columns from the origin to an atom: those that are on the line, else by the spacing.
+   * @param {number} index
+   */
   guess(index) {
     if (!index) return;
     const { model } = this.editor;
@@ -104,25 +147,32 @@ export class LatticeTool {
     });
     const count = on ? on + 1 : Math.max(1, Math.round(length / spacing));
     const name = "0ab"[index];
-    this.fields[`${name}_count`].value = count;
-    this.fields[`${name}_after`].value = count;
-    this.fields[`${name}_before`].value = 0;
+    this.fields[`${name}_count`].value = this.fields[`${name}_after`].value = String(count);
+    this.fields[`${name}_before`].value = "0";
   }
 
+  /** @param {string} name */
   value(name) {
     const number = Number(this.fields[name].value);
     const least = COUNTS.includes(name) ? 1 : 0;
     return Number.isInteger(number) && number >= least && number <= 100_000 ? number : null;
   }
 
-  /** The numbers of the fields; null where one is missing or wrong. */
+  /**
+   * The numbers of the fields; null where one is missing or wrong.
+   * @returns {Counts | null}
+   */
   values() {
     const numbers = Object.fromEntries([...COUNTS, ...RANGES].map((name) => [name, this.value(name)]));
-    for (const name of [...COUNTS, ...RANGES]) this.fields[name].setAttribute("aria-invalid", numbers[name] === null);
-    return Object.values(numbers).includes(null) ? null : numbers;
+    for (const name of [...COUNTS, ...RANGES]) this.fields[name].setAttribute("aria-invalid", String(numbers[name] === null));
+    return Object.values(numbers).includes(null) ? null : /** @type {Counts} */ (/** @type {unknown} */ (numbers));
   }
 
-  /** Steps of the lattice along a and b, px. */
+  /**
+   * Steps of the lattice along a and b, px.
+   * @param {Counts} values
+   * @returns {{ a: Point, b: Point }}
+   */
   vectors(values) {
     const [origin, a, b] = this.handles;
     return {
@@ -134,15 +184,16 @@ export class LatticeTool {
   changed() {
     const { panel, handles, editor } = this;
     const complete = handles.length === 3;
-    panel.querySelector("[data-part=counts]").hidden = !complete;
-    panel.querySelector("[data-do=restart]").disabled = !handles.length;
-    setText(panel.querySelector("[data-part=step]"), complete ? "" : STEPS[handles.length]);
-    panel.querySelector("[data-part=step]").hidden = complete;
+    find("[data-part=counts]", undefined, panel).hidden = !complete;
+    find("[data-do=restart]", HTMLButtonElement, panel).disabled = !handles.length;
+    setText(find("[data-part=step]", undefined, panel), complete ? "" : STEPS[handles.length]);
+    find("[data-part=step]", undefined, panel).hidden = complete;
     this.sites = complete ? this.compute() : null;
-    if (complete) this.tell();
+    if (this.sites) this.tell(this.sites);
     editor.redraw();
   }
 
+  /** @returns {Sites | { problem: string }} */
   compute() {
     const values = this.values();
     if (!values) return { problem: "Counts are whole numbers." };
@@ -155,7 +206,8 @@ export class LatticeTool {
     const spacing = Math.min(...[a, b, { x: a.x + b.x, y: a.y + b.y }, { x: a.x - b.x, y: a.y - b.y }].map(({ x, y }) => Math.hypot(x, y)));
     const reach = SAME * Math.min(spacing, model.spacing ?? spacing);
     const [origin] = this.handles;
-    const found = { values, spacing, places: [], outside: 0, known: 0, total: rows * columns };
+    /** @type {Sites} */
+    const found = { values, spacing, places: [], outside: 0, known: 0, total: rows * columns, fresh: 0 };
     for (let j = -values.b_before; j <= values.b_after; j++) {
       for (let i = -values.a_before; i <= values.a_after; i++) {
         const [x, y] = [origin.x + i * a.x + j * b.x, origin.y + i * a.y + j * b.y];
@@ -164,7 +216,7 @@ export class LatticeTool {
           continue;
         }
         const known = model.grid.nearest(x, y, reach) !== null;
-        found.known += known;
+        found.known += Number(known);
         if (found.places.length < MOST_SHOWN) found.places.push({ x, y, known });
       }
     }
@@ -172,17 +224,18 @@ export class LatticeTool {
     return found;
   }
 
-  tell() {
-    const { panel, sites } = this;
-    const button = panel.querySelector("[type=submit]");
-    button.disabled = Boolean(sites.problem) || !sites.fresh;
-    setText(button, sites.fresh ? `Add ${several(sites.fresh, "column")}` : "Nothing to add");
-    const parts = sites.problem ? [sites.problem] : [
+  /** @param {Sites | { problem: string }} sites */
+  tell(sites) {
+    const { panel } = this, fresh = "fresh" in sites ? sites.fresh : 0;
+    const button = find("[type=submit]", HTMLButtonElement, panel);
+    button.disabled = !fresh;
+    setText(button, fresh ? `Add ${several(fresh, "column")}` : "Nothing to add");
+    const parts = "problem" in sites ? [sites.problem] : [
       `${several(sites.total, "site")}, ${sites.spacing.toFixed(1)} px apart`,
       sites.outside && `${sites.outside} outside the image`,
       sites.known && `${sites.known} are columns already (grey)`,
     ].filter(Boolean);
-    setText(panel.querySelector("[data-part=told]"), parts.join(" · "));
+    setText(find("[data-part=told]", undefined, panel), parts.join(" · "));
   }
 
   /** Repeat it as often as the image needs. */
@@ -194,25 +247,27 @@ export class LatticeTool {
     const [origin] = this.handles;
     const area = a.x * b.y - a.y * b.x;
     if (!area) return;
-    const ends = { a: [], b: [] };
+    const ends = /** @type {Record<string, number[]>} */ ({ a: [], b: [] });
     for (const [x, y] of [[-0.5, -0.5], [view.width - 0.5, -0.5], [-0.5, view.height - 0.5], [view.width - 0.5, view.height - 0.5]]) {
       const [dx, dy] = [x - origin.x, y - origin.y];
       ends.a.push((dx * b.y - dy * b.x) / area);
       ends.b.push((dy * a.x - dx * a.y) / area);
     }
     for (const name of ["a", "b"]) {
-      this.fields[`${name}_before`].value = Math.max(0, Math.ceil(-Math.min(...ends[name])));
-      this.fields[`${name}_after`].value = Math.max(0, Math.ceil(Math.max(...ends[name])));
+      this.fields[`${name}_before`].value = String(Math.max(0, Math.ceil(-Math.min(...ends[name]))));
+      this.fields[`${name}_after`].value = String(Math.max(0, Math.ceil(Math.max(...ends[name]))));
     }
     this.changed();
   }
 
-  /** The lattice as the API takes it: its origin is the first site, which may be before the one that was clicked. */
-  request() {
-    const { values } = this.sites;
+  /**
+   * The lattice as the API takes it: its origin is the first site, which may be before the one that was clicked.
+   * @param {Counts} values
+   */
+  request(values) {
     const { a, b } = this.vectors(values);
     const [origin, toA, toB] = this.handles;
-    const first = (name) => ["x", "y"].map((axis) => -values.a_before * a[axis] - values.b_before * b[axis] + name[axis]);
+    const first = (/** @type {Point} */ name) => ["x", "y"].map((axis) => -values.a_before * a[axis] - values.b_before * b[axis] + name[axis]);
     return {
       origin: first(origin), a: first(toA), b: first(toB), a_count: values.a_count, b_count: values.b_count,
       a_repeats: values.a_before + values.a_after + 1, b_repeats: values.b_before + values.b_after + 1,
@@ -221,11 +276,11 @@ export class LatticeTool {
   }
 
   async add() {
-    if (this.handles.length < 3 || !this.sites?.fresh) return;
-    const { editor } = this;
+    const { editor, sites } = this;
+    if (this.handles.length < 3 || !sites || !("fresh" in sites) || !sites.fresh) return;
     const { model } = editor;
     const beside = [...model.columns.values()].map(({ x, y }) => [x, y]);
-    const found = await editor.ask("/columns/lattice", { ...this.request(), beside });
+    const found = await editor.ask("/columns/lattice", { ...this.request(sites.values), beside });
     if (!found) return;
     const added = model.created(found.columns);
     model.edit(`Add a lattice of ${several(added.length, "column")}`, { put: added });
@@ -240,10 +295,15 @@ export class LatticeTool {
     editor.choose("select");
   }
 
+  /**
+   * @param {CanvasRenderingContext2D} pen
+   * @param {ImageView} view
+   */
   paint(pen, view) {
     if (!this.handles.length) return;
+    const sites = this.sites && "values" in this.sites ? this.sites : null;
     const colour = this.editor.colours.get(this.fields.kind.value.trim()) ?? "#ffd54a";
-    const steps = this.sites?.values && { a: this.sites.values.a_count, b: this.sites.values.b_count };
-    paintLattice(pen, view, { sites: this.sites, handles: this.handles, steps, colour });
+    const steps = sites && { a: sites.values.a_count, b: sites.values.b_count };
+    paintLattice(pen, view, { sites, handles: this.handles, steps, colour });
   }
 }

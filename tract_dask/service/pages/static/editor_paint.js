@@ -1,5 +1,27 @@
 // What is drawn over the image: columns, their refined positions, and the shapes of the tools. All in CSS px.
 
+import { penOf } from "./dom.js";
+
+/**
+ * @import { Column, Model } from "./editor_model.js"
+ * @import { Sites } from "./editor_lattice.js"
+ * @import { ImageView, Point } from "./image_view.js"
+ * @typedef {{ ids: Set<number>, dx: number, dy: number }} Moving columns, and how far they are dragged
+ * @typedef {{ of: Column, x: number, y: number, flags: string[], with?: undefined }} Fitted where the fit of a column is
+ * @typedef {{ of: Column, with: number, x?: undefined, y?: undefined, flags?: undefined }} Merged with the column that it fell together with
+ * @typedef {Map<number, Fitted | Merged>} RefinedColumns
+ * @typedef {object} Scene
+ * @property {Model} model
+ * @property {Map<string, string>} colours
+ * @property {Moving | null} moving
+ * @property {Column | null} hovered
+ * @property {RefinedColumns | null} refined
+ * @property {boolean} numbers
+ * @property {number | null} pixelSizePm
+ * @typedef {{ colour: string, whole: number[], broken: number[] }} Group places of whole and of broken rings, as x, y, x, y ...
+ * @typedef {CanvasRenderingContext2D} Pen
+ */
+
 // Bright on grey, told apart by those who see fewer colours (after Okabe and Ito); the first is for columns without a kind.
 const KINDS = ["#4fc3ff", "#ffb000", "#5ee08a", "#ff7fb6", "#f4e84a", "#b69bff", "#ff8a5c", "#c4f0ff"];
 const SHADE = "rgb(0 0 0 / 60%)";
@@ -19,7 +41,10 @@ export const FLAGS = {
   bad_frame: "bad frame",
 };
 
-/** The colour of each kind, in the order in which they came up. */
+/**
+ * The colour of each kind, in the order in which they came up.
+ * @param {Iterable<string>} kinds
+ */
 export function kindColours(kinds) {
   const named = [...kinds].filter((kind) => kind !== "");
   const colours = new Map(named.map((kind, index) => [kind, KINDS[1 + (index % (KINDS.length - 1))]]));
@@ -30,25 +55,33 @@ export function kindColours(kinds) {
 const isUnfitted = (flags) => flags.includes("outside_frame");
 const isDoubtful = (flags) => flags.some((flag) => flag in FLAGS && flag !== "outside_frame");
 
-/** The radius of a column's ring, px. */
+/**
+ * The radius of a column's ring, px.
+ * @param {ImageView} view
+ * @param {number | null} spacing
+ */
 export function ringRadius(view, spacing) {
   return Math.min(13, Math.max(2.5, 0.17 * (spacing ?? 40) * view.scale));
 }
 
 /**
  * Draw the columns that can be seen.
- * `scene`: {model, colours, moving: {ids, dx, dy} or null, hovered, refined: Map or null, numbers, pixelSizePm}.
+ * @param {Pen} pen
+ * @param {ImageView} view
+ * @param {Scene} scene
  */
 export function paintColumns(pen, view, scene) {
   const { model, colours, moving, hovered } = scene;
   const radius = ringRadius(view, model.spacing);
   const { x0, y0, x1, y1 } = view.visible();
   const beyond = (radius + 4) / view.scale;
-  const groups = new Map(); // by kind: places of whole and of broken rings, as x, y, x, y ...
-  const [selected, doubtful, labelled] = [[], [], []];
-  let [kind, group] = [null, null];
+  /** @type {Map<string, Group>} */
+  const groups = new Map(); // by kind
+  const selected = /** @type {number[]} */ ([]), doubtful = /** @type {number[]} */ ([]);
+  const labelled = /** @type {[Column, number, number][]} */ ([]);
+  let kind = "", group = /** @type {Group | null} */ (null);
   const { scale, size, middle } = view;
-  const place = (column, dx = 0, dy = 0) => {
+  const place = (/** @type {Column} */ column, dx = 0, dy = 0) => {
     const x = (column.x + dx - middle.x) * scale + size.width / 2; // as view.toScreen, for very many
     const y = (column.y + dy - middle.y) * scale + size.height / 2;
     if (column.kind !== kind || !group) {
@@ -65,11 +98,14 @@ export function paintColumns(pen, view, scene) {
   model.grid.visit(x0 - beyond, y0 - beyond, x1 + beyond, y1 + beyond, (column) => {
     if (!moving?.ids.has(column.id)) place(column);
   });
-  for (const id of moving?.ids ?? []) place(model.columns.get(id), moving.dx, moving.dy);
+  for (const id of moving?.ids ?? []) {
+    const column = model.columns.get(id);
+    if (column && moving) place(column, moving.dx, moving.dy);
+  }
 
   pen.save();
   if (radius < DENSE) {
-    const all = [...groups.values()].flatMap(({ colour, whole, broken }) => [[whole, colour], [broken, colour]]);
+    const all = [...groups.values()].flatMap(({ colour, whole, broken }) => /** @type {[number[], string][]} */ ([[whole, colour], [broken, colour]]));
     dots(pen, view, [...all, [doubtful, WARNING]]);
   } else {
     for (const { colour, whole, broken } of groups.values()) {
@@ -91,6 +127,13 @@ export function paintColumns(pen, view, scene) {
   pen.restore();
 }
 
+/**
+ * @param {Pen} pen
+ * @param {number[]} places
+ * @param {number} radius
+ * @param {string} colour
+ * @param {boolean} broken
+ */
 function rings(pen, places, radius, colour, broken, width = 2) {
   if (!places.length) return;
   circles(pen, places, radius);
@@ -105,7 +148,12 @@ function rings(pen, places, radius, colour, broken, width = 2) {
   pen.setLineDash([]);
 }
 
-/** The path of a circle around each place, x, y, x, y ... */
+/**
+ * The path of a circle around each place, x, y, x, y ...
+ * @param {Pen} pen
+ * @param {number[]} places
+ * @param {number} radius
+ */
 function circles(pen, places, radius) {
   pen.beginPath();
   for (let n = 0; n < places.length; n += 2) {
@@ -114,16 +162,21 @@ function circles(pen, places, radius) {
   }
 }
 
-let [dotted, layer] = [null, null]; // kept from one drawing to the next
+let kept = /** @type {{ dotted: HTMLCanvasElement, layer: ImageData } | null} */ (null); // from one drawing to the next
 
-/** Squares of a few pixels, written straight into an image: there may be very many. `groups`: [[places, colour]]. */
+/**
+ * Squares of a few pixels, written straight into an image: there may be very many.
+ * @param {Pen} pen
+ * @param {ImageView} view
+ * @param {[places: number[], colour: string][]} groups
+ */
 function dots(pen, view, groups) {
   const { ratio } = view;
   const [width, height] = [pen.canvas.width, pen.canvas.height];
-  if (dotted?.width !== width || dotted.height !== height) {
-    dotted = Object.assign(document.createElement("canvas"), { width, height });
-    layer = new ImageData(width, height);
+  if (kept?.dotted.width !== width || kept.dotted.height !== height) {
+    kept = { dotted: Object.assign(document.createElement("canvas"), { width, height }), layer: new ImageData(width, height) };
   }
+  const { dotted, layer } = kept;
   const pixels = new Uint32Array(layer.data.buffer).fill(0);
   const square = (x, y, half, colour) => {
     const left = Math.max(0, Math.round((x - half) * ratio));
@@ -138,10 +191,15 @@ function dots(pen, view, groups) {
     for (let n = 0; n < places.length; n += 2) square(places[n], places[n + 1], 2.5, 0x99000000);
     for (let n = 0; n < places.length; n += 2) square(places[n], places[n + 1], 1.5, rgba);
   }
-  dotted.getContext("2d").putImageData(layer, 0, 0);
+  penOf(dotted).putImageData(layer, 0, 0);
   pen.drawImage(dotted, 0, 0, width / ratio, height / ratio);
 }
 
+/**
+ * @param {Pen} pen
+ * @param {number[]} places
+ * @param {number} radius
+ */
 function badges(pen, places, radius) {
   for (let n = 0; n < places.length; n += 2) {
     pen.beginPath();
@@ -154,6 +212,11 @@ function badges(pen, places, radius) {
   }
 }
 
+/**
+ * @param {Pen} pen
+ * @param {number[]} places
+ * @param {number} radius
+ */
 function marked(pen, places, radius) {
   if (!places.length) return;
   circles(pen, places, Math.max(radius + 4, 4.5));
@@ -193,7 +256,7 @@ function paintRefined(pen, view, { model, refined, pixelSizePm }, columns, radiu
     }
     if (roomy) label(pen, shiftText(column, found, pixelSizePm), from.x, from.y + radius + 14, "center");
   }
-  for (const [path, colour] of [[lines, REFINED], [crosses, REFINED], [lost, WARNING]]) {
+  for (const [path, colour] of /** @type {[Path2D, string][]} */ ([[lines, REFINED], [crosses, REFINED], [lost, WARNING]])) {
     pen.strokeStyle = SHADE;
     pen.lineWidth = 3.5;
     pen.stroke(path);
@@ -203,12 +266,31 @@ function paintRefined(pen, view, { model, refined, pixelSizePm }, columns, radiu
   }
 }
 
-/** How far the fit is from where the column was put: pm, or px where a pixel's size is not known. */
+/**
+ * Whether a column has a fit of its own.
+ * @param {Fitted | Merged} found
+ * @returns {found is Fitted}
+ */
+export const isFitted = (found) => found.with === undefined;
+
+/**
+ * How far the fit is from where the column was put: pm, or px where a pixel's size is not known.
+ * @param {Column} column
+ * @param {Fitted} found
+ * @param {number | null} pixelSizePm
+ */
 export function shiftText(column, found, pixelSizePm) {
   const shift = Math.hypot(found.x - column.x, found.y - column.y);
   return pixelSizePm ? `${(shift * pixelSizePm).toFixed(shift * pixelSizePm < 10 ? 1 : 0)} pm` : `${shift.toFixed(2)} px`;
 }
 
+/**
+ * @param {Pen} pen
+ * @param {string} text
+ * @param {number} x
+ * @param {number} y
+ * @param {CanvasTextAlign} align
+ */
 export function label(pen, text, x, y, align = "left") {
   pen.font = "600 11px system-ui, sans-serif";
   pen.textAlign = align;
@@ -220,7 +302,13 @@ export function label(pen, text, x, y, align = "left") {
   pen.fillText(text, x, y);
 }
 
-/** A closed line or a box that is being drawn, [{x, y}] in image coordinates. */
+/**
+ * A closed line or a box that is being drawn, [{x, y}] in image coordinates.
+ * @param {Pen} pen
+ * @param {ImageView} view
+ * @param {Point[]} line
+ * @param {boolean} danger
+ */
 export function paintOutline(pen, view, line, danger) {
   if (line.length < 2) return;
   pen.save();
@@ -243,7 +331,12 @@ export function paintOutline(pen, view, line, danger) {
   pen.restore();
 }
 
-/** The sites of a lattice that is being laid, its three atoms, and the steps between them. */
+/**
+ * The sites of a lattice that is being laid, its three atoms, and the steps between them.
+ * @param {Pen} pen
+ * @param {ImageView} view
+ * @param {{ sites: Sites | null, handles: Point[], steps: Record<string, number> | null, colour: string }} lattice
+ */
 export function paintLattice(pen, view, { sites, handles, steps, colour }) {
   pen.save();
   const { x0, y0, x1, y1 } = view.visible();
@@ -259,7 +352,7 @@ export function paintLattice(pen, view, { sites, handles, steps, colour }) {
     path.lineTo(at.x - half, at.y);
     path.closePath();
   }
-  for (const [path, stroke] of [[paths.known, "#9aa4ad"], [paths.new, colour]]) {
+  for (const [path, stroke] of /** @type {[Path2D, string][]} */ ([[paths.known, "#9aa4ad"], [paths.new, colour]])) {
     pen.lineWidth = 3.5;
     pen.strokeStyle = SHADE;
     pen.stroke(path);
@@ -268,18 +361,18 @@ export function paintLattice(pen, view, { sites, handles, steps, colour }) {
     pen.stroke(path);
   }
   const places = handles.map(({ x, y }) => view.toScreen(x, y));
-  for (const [index, name] of [[1, "a"], [2, "b"]]) {
+  for (const [index, name] of /** @type {[number, string][]} */ ([[1, "a"], [2, "b"]])) {
     if (!places[index]) continue;
     pen.beginPath();
     pen.moveTo(places[0].x, places[0].y);
     pen.lineTo(places[index].x, places[index].y);
-    for (const [stroke, width] of [[SHADE, 4], ["#fff", 1.75]]) {
+    for (const [stroke, width] of /** @type {[string, number][]} */ ([[SHADE, 4], ["#fff", 1.75]])) {
       pen.strokeStyle = stroke;
       pen.lineWidth = width;
       pen.stroke();
     }
     const count = steps?.[name];
-    for (let step = 1; step < (count ?? 0); step++) {
+    for (let step = 1; count && step < count; step++) {
       const share = step / count;
       pen.fillStyle = "#fff";
       pen.fillRect(places[0].x + share * (places[index].x - places[0].x) - 2, places[0].y + share * (places[index].y - places[0].y) - 2, 4, 4);

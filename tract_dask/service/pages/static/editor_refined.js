@@ -3,16 +3,29 @@
 import { post } from "./api.js";
 import { h, setText } from "./dom.js";
 import { several } from "./format.js";
-import { FLAGS } from "./editor_paint.js";
+import { FLAGS, isFitted } from "./editor_paint.js";
+
+/**
+ * @import { Editor } from "./editor.js"
+ * @import { RefinedColumns } from "./editor_paint.js"
+ */
 
 const WAIT_MS = 500; // after a change
 
 export class Refined {
+  /**
+   * @param {Editor} editor
+   * @param {HTMLElement} element
+   */
   constructor(editor, element) {
     this.editor = editor;
     this.element = element;
     this.shown = false;
-    this.found = new Map(); // number -> {of: the column, x, y, flags} or {of, with: the column that it fell together with}
+    /** @type {RefinedColumns} */
+    this.found = new Map(); // by number of the column
+    this.timer = 0;
+    /** @type {AbortController | null} */
+    this.request = null;
     this.message = h("p", { class: "small" });
     this.problem = h("p", { class: "small problem" });
     this.twins = h("button", { type: "button", class: "link small", onclick: () => this.selectTwins() });
@@ -52,6 +65,11 @@ export class Refined {
     return [...this.found].filter(([id, { of }]) => model.columns.get(id) === of);
   }
 
+  /** The fits of those that have one in the image. */
+  fitted() {
+    return this.current().map(([, found]) => found).filter(isFitted).filter(({ flags }) => !flags.includes("outside_frame"));
+  }
+
   async ask() {
     const { editor } = this;
     const { model } = editor;
@@ -68,8 +86,14 @@ export class Refined {
     try {
       const answer = await post(`${editor.path}/columns/refine`, { columns: model.rows() }, { signal: request.signal });
       this.found = new Map();
-      for (const { column_id: id, x, y, flags } of answer.columns) this.found.set(id, { of: asked.get(id), x, y, flags });
-      for (const [first, twin] of answer.merged) this.found.set(twin, { of: asked.get(twin), with: first });
+      for (const { column_id: id, x, y, flags } of answer.columns) {
+        const of = asked.get(id);
+        if (of) this.found.set(id, { of, x, y, flags });
+      }
+      for (const [first, twin] of answer.merged) {
+        const of = asked.get(twin);
+        if (of) this.found.set(twin, { of, with: first });
+      }
     } catch (error) {
       if (request.signal.aborted) return;
       setText(this.problem, error.what ?? error.message);
@@ -82,9 +106,9 @@ export class Refined {
   tell() {
     const { editor } = this;
     const current = this.current();
-    const fitted = current.filter(([, { with: twin, flags }]) => twin === undefined && !flags.includes("outside_frame"));
+    const fitted = this.fitted();
     const twins = current.filter(([, found]) => found.with !== undefined);
-    const shifts = fitted.map(([, { of, x, y }]) => Math.hypot(x - of.x, y - of.y)).sort((one, other) => one - other);
+    const shifts = fitted.map(({ of, x, y }) => Math.hypot(x - of.x, y - of.y)).sort((one, other) => one - other);
     const length = (px) => (editor.pixelSizePm ? `${(px * editor.pixelSizePm).toFixed(1)} pm` : `${px.toFixed(2)} px`);
     const flagged = Object.entries(FLAGS)
       .map(([flag, text]) => [text, current.filter(([, { flags }]) => flags?.includes(flag)).length])
@@ -92,7 +116,7 @@ export class Refined {
       .map(([text, number]) => `${number} ${text}`);
     const busy = this.request || current.length < editor.model.size;
     setText(this.message, busy ? "Fitting …" : shifts.length
-      ? [`Shift: median ${length(shifts[shifts.length >> 1])}, largest ${length(shifts.at(-1))}`, ...flagged].join(" · ")
+      ? [`Shift: median ${length(shifts[shifts.length >> 1])}, largest ${length(shifts[shifts.length - 1])}`, ...flagged].join(" · ")
       : "No column could be fitted.");
     this.element.toggleAttribute("aria-busy", Boolean(busy));
     this.twins.hidden = !twins.length;
@@ -106,9 +130,7 @@ export class Refined {
 
   /** Move the columns to where their fits are, with what these say of them. */
   takeOver() {
-    const put = this.current()
-      .filter(([, found]) => found.with === undefined && !found.flags.includes("outside_frame"))
-      .map(([, { of, x, y, flags }]) => Object.freeze({ ...of, x, y, flags }));
+    const put = this.fitted().map(({ of, x, y, flags }) => Object.freeze({ ...of, x, y, flags }));
     this.editor.model.edit(`Move ${several(put.length, "column")} to the refined positions`, { put });
     for (const column of put) this.found.set(column.id, { of: column, x: column.x, y: column.y, flags: column.flags });
     this.tell();

@@ -3,6 +3,11 @@
 import { several } from "./format.js";
 import { ringRadius } from "./editor_paint.js";
 
+/**
+ * @import { Editor } from "./editor.js"
+ * @import { Gesture, Point, Pointed } from "./image_view.js"
+ */
+
 const CLICK_PX = 4; // a pointer that moved less has clicked
 
 export const TOOLS = {
@@ -28,13 +33,23 @@ export const TOOLS = {
   },
 };
 
-/** The gesture that begins where the pointer is down; null: the view moves. */
+/**
+ * The gesture that begins where the pointer is down; null: the view moves.
+ * @param {Editor} editor
+ * @param {Pointed} point
+ * @param {PointerEvent} event
+ * @returns {Gesture | null}
+ */
 export function beginGesture(editor, point, event) {
   if (editor.spaceDown) return null;
   return { select: selecting, lasso: lassoing, erase: erasing, add: adding, lattice: latticing }[editor.tool](editor, point, event);
 }
 
-/** The column under the pointer. */
+/**
+ * The column under the pointer.
+ * @param {Editor} editor
+ * @param {Point} point
+ */
 export function hit(editor, { x, y }) {
   const { model, view } = editor;
   return model.grid.nearest(x, y, (Math.max(6, ringRadius(view, model.spacing)) + 4) / view.scale);

@@ -6,9 +6,44 @@ import { count, fullTime, hasEnded, moment, several } from "./format.js";
 
 const DRAFT_MS = 400;
 
+/**
+ * @import { Editor } from "./editor.js"
+ * @import { Draft } from "./editor_model.js"
+ * @typedef {{ version: number, author: string, time: string, note: string, count: number }} Version
+ * @typedef {object} Known what the API says of the versions
+ * @property {string} state of the job
+ * @property {Version[]} versions
+ * @property {number | null} chosen
+ * @property {number} next_column_id
+ * @property {boolean} may_save
+ * @property {boolean} may_continue
+ * @typedef {object} Places
+ * @property {HTMLElement} list
+ * @property {HTMLInputElement} note
+ * @property {HTMLElement} unsaved
+ * @property {HTMLButtonElement} save
+ * @property {HTMLButtonElement} goOn
+ * @property {boolean} alone whether the editor was opened by itself
+ * @property {boolean} framed whether it is a part of another page
+ */
+
 export class Versions {
+  /**
+   * @param {Editor} editor
+   * @param {Places} places
+   */
   constructor(editor, { list, note, unsaved, save, goOn, alone, framed }) {
-    Object.assign(this, { editor, list, note, unsaved, save, goOn, alone, framed, busy: false });
+    this.editor = editor;
+    this.list = list;
+    this.note = note;
+    this.unsaved = unsaved;
+    this.save = save;
+    this.goOn = goOn;
+    this.alone = alone;
+    this.busy = this.left = false;
+    this.timer = 0;
+    /** @type {Known | null} */
+    this.known = null;
     this.key = `tract_dask.columns.${alone ? location.pathname : editor.job}`;
     save.onclick = () => this.keep();
     goOn.onclick = () => this.continue();
@@ -29,23 +64,30 @@ export class Versions {
 
   /** Load what there is: the draft where there is one, else the newest version. */
   async open() {
-    await this.refresh();
+    const { versions } = await this.refresh();
     const draft = this.draft();
-    const newest = this.known.versions.at(-1).version;
+    const newest = versions[versions.length - 1].version;
     const wanted = new URLSearchParams(location.search).get("version");
     const asked = wanted === null ? newest : Number(wanted);
     const base = draft?.version ?? asked;
-    await this.load(this.known.versions.some(({ version }) => version === base) ? base : newest, false);
+    await this.load(versions.some(({ version }) => version === base) ? base : newest, false);
     if (draft && this.editor.model.restore(draft)) {
       toast("Changes that were not saved are back; undo takes them away.", "good");
     }
   }
 
   async refresh() {
-    this.known = await get(`/jobs/${this.editor.job}/columns`);
+    /** @type {Known} */
+    const known = await get(`/jobs/${this.editor.job}/columns`);
+    this.known = known;
     this.tell();
+    return known;
   }
 
+  /**
+   * Show a version; with care, ask where changes would be lost.
+   * @param {number} version
+   */
   async load(version, careful = true) {
     const { model } = this.editor;
     if (careful && model.dirty) {
@@ -57,7 +99,7 @@ export class Versions {
     }
     const table = await get(`/jobs/${this.editor.job}/columns/${version}`);
     const columns = table.columns.map(({ column_id: id, x, y, kind, flags }) => ({ id, x, y, kind, flags }));
-    model.load({ version, columns, spacing: table.spacing_px, nextId: this.known.next_column_id });
+    model.load({ version, columns, spacing: table.spacing_px, nextId: this.known?.next_column_id ?? 1 });
     if (careful) this.forgetDraft();
     this.tell();
     if (version) this.editor.refined.flags();
@@ -93,7 +135,7 @@ export class Versions {
   /** Let the job go on with these columns. */
   async continue() {
     const { editor, known } = this;
-    if (!this.alone && hasEnded(known.state)) {
+    if (!this.alone && known && hasEnded(known.state)) {
       const sure = await ask({
         title: "Fit every frame again?", text: "The tracks that the job has are replaced by those of these columns.", action: "Fit again",
       });
@@ -131,10 +173,11 @@ export class Versions {
     this.list.replaceChildren(...[...known.versions].reverse().map((one) => this.row(one)));
   }
 
+  /** @param {Version} one */
   row(one) {
     const { model } = this.editor;
     const current = one.version === model.version;
-    const marks = [current && (model.dirty ? "changed here" : "shown"), one.version === this.known.chosen && "chosen"].filter(Boolean);
+    const marks = [current && (model.dirty ? "changed here" : "shown"), one.version === this.known?.chosen && "chosen"].filter(Boolean);
     return h("li", { class: current ? "current" : null },
       h("button", { type: "button", onclick: () => this.load(one.version).catch(toast), disabled: current && !model.dirty, title: `Load version ${one.version}${one.note ? `: ${one.note}` : ""}` },
         h("span", { class: "version-number" }, String(one.version)),
@@ -144,9 +187,10 @@ export class Versions {
           marks.length ? h("span", { class: "version-mark" }, marks.join(", ")) : null)));
   }
 
+  /** @returns {Draft | null} */
   draft() {
     try {
-      return JSON.parse(sessionStorage.getItem(this.key));
+      return JSON.parse(sessionStorage.getItem(this.key) ?? "null");
     } catch {
       return null;
     }

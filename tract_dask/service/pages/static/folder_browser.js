@@ -10,10 +10,22 @@ const ICONS = {
   file: "M5 3h6l4 4v10H5zM11 3v4h4",
 };
 
+/** @typedef {{ name: string, path: string, kind: "folder" | "movie" | "file" | "unusable", bytes: number | null, modified: string }} Entry */
+
 /** Shows `element` a folder at a time; `onMovie(path)` when a movie is chosen, `onFolder(path)` when a folder is opened. */
 export class FolderBrowser {
+  /**
+   * @param {HTMLElement} element
+   * @param {{ onMovie: (path: string) => void, onFolder: (path: string) => void }} options
+   */
   constructor(element, { onMovie, onFolder }) {
-    Object.assign(this, { onMovie, onFolder, path: "", entries: [], next: null });
+    this.onMovie = onMovie;
+    this.onFolder = onFolder;
+    this.path = "";
+    /** @type {Entry[]} */
+    this.entries = [];
+    /** @type {string | null} */
+    this.next = null;
     this.crumbs = h("nav", { class: "crumbs", "aria-label": "Folder" });
     this.filter = h("input", { class: "input", type: "search", placeholder: "Filter by name", "aria-label": "Filter by name", autocomplete: "off", oninput: () => this.show() });
     this.body = h("tbody", {});
@@ -30,7 +42,10 @@ export class FolderBrowser {
         h("button", { class: "button" }, "Open")));
   }
 
-  /** Read and show a folder; "" is the data root. */
+  /**
+   * Read and show a folder; "" is the data root.
+   * @param {string} path
+   */
   async open(path, note = true) {
     const mine = this.opening = Symbol(path);
     if (note) this.onFolder(path);
@@ -39,7 +54,7 @@ export class FolderBrowser {
     try {
       const { entries, next } = await get("/files", { path });
       if (this.opening !== mine) return;
-      Object.assign(this, { path, entries, next });
+      [this.path, this.entries, this.next] = [path, entries, next];
       this.filter.value = "";
       this.show();
       this.scroll.scrollTop = 0;
@@ -52,17 +67,20 @@ export class FolderBrowser {
     }
   }
 
-  /** Read the next page of the folder, and show it with those before. */
-  async more(event) {
+  /**
+   * Read the next page of the folder, and show it with those before.
+   * @param {HTMLButtonElement} button
+   */
+  async more(button) {
     const mine = this.opening;
-    event.target.disabled = true;
+    button.disabled = true;
     try {
       const { entries, next } = await get("/files", { path: this.path, after: this.next });
       if (this.opening !== mine) return;
-      Object.assign(this, { entries: [...this.entries, ...entries], next });
+      [this.entries, this.next] = [[...this.entries, ...entries], next];
       this.show();
     } catch (error) {
-      if (this.opening === mine) event.target.replaceWith(h("p", { class: "empty" }, `${error.what}. ${error.remedy}`));
+      if (this.opening === mine) button.replaceWith(h("p", { class: "empty" }, `${error.what}. ${error.remedy}`));
     }
   }
 
@@ -75,7 +93,7 @@ export class FolderBrowser {
   showCrumbs(path) {
     const parts = path.split("/").filter(Boolean);
     const crumb = (name, to, last) => h("button", { type: "button", "aria-current": last ? "location" : null, onclick: () => this.open(to) }, name);
-    const items = [crumb("Data root", "", parts.length === 0)];
+    const items = /** @type {HTMLElement[]} */ ([crumb("Data root", "", parts.length === 0)]);
     parts.forEach((name, index) => items.push(h("span", { class: "muted", "aria-hidden": "true" }, "/"), crumb(name, parts.slice(0, index + 1).join("/"), index === parts.length - 1)));
     this.crumbs.replaceChildren(...items);
   }
@@ -87,9 +105,10 @@ export class FolderBrowser {
     const movies = seen.filter((entry) => entry.kind === "movie").length;
     const empty = wanted ? "Nothing here has this in its name." : "This folder is empty. Put a movie into it: TIFF, MRC, HDF5, .npy, raw, or a folder of images.";
     this.note.replaceChildren(seen.length ? h("p", { class: "sr", "aria-live": "polite" }, `${several(seen.length, "entry", "entries")}, ${several(movies, "movie")}`) : h("p", { class: "empty" }, this.next ? "None of those that were read so far." : empty),
-      this.next ? h("button", { type: "button", class: "button", onclick: (event) => this.more(event) }, `Show more than ${this.entries.length} entries`) : "");
+      this.next ? h("button", { type: "button", class: "button", onclick: (/** @type {Event & { currentTarget: HTMLButtonElement }} */ event) => this.more(event.currentTarget) }, `Show more than ${this.entries.length} entries`) : "");
   }
 
+  /** @param {Entry} entry */
   row(entry) {
     const { kind } = entry;
     const choose = () => (kind === "folder" ? this.open(entry.path) : this.onMovie(entry.path));
@@ -104,11 +123,12 @@ export class FolderBrowser {
   }
 }
 
+/** @param {keyof typeof ICONS} kind */
 function icon(kind) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-  for (const [name, value] of Object.entries({ viewBox: "0 0 20 20", width: 18, height: 18, role: "img", "aria-label": kind })) svg.setAttribute(name, value);
+  for (const [name, value] of Object.entries({ viewBox: "0 0 20 20", width: "18", height: "18", role: "img", "aria-label": kind })) svg.setAttribute(name, value);
   const path = document.createElementNS(svg.namespaceURI, "path");
-  for (const [name, value] of Object.entries({ d: ICONS[kind], fill: "none", stroke: "currentColor", "stroke-width": 1.3, "stroke-linejoin": "round" })) path.setAttribute(name, value);
+  for (const [name, value] of Object.entries({ d: ICONS[kind], fill: "none", stroke: "currentColor", "stroke-width": "1.3", "stroke-linejoin": "round" })) path.setAttribute(name, value);
   svg.append(path);
   return svg;
 }

@@ -1,7 +1,7 @@
 // A job while it runs and after: kept up to date by its events, and by what its finished shards say.
 
 import { get, post, subscribe, toast } from "./api.js";
-import { h, setAttribute, setText } from "./dom.js";
+import { at, find, h, setAttribute, setText } from "./dom.js";
 import { between, count, duration, fullTime, hasEnded, isDone, left, moment, nameOf, percent, rate, several, STAGES, STATES } from "./format.js";
 import { actionButton, actionsOf, isCancelling, mayChange } from "./job_actions.js";
 import { FrameCharts, Throughput } from "./job_charts.js";
@@ -10,20 +10,22 @@ import { JobPicture } from "./job_picture.js";
 import { Stages } from "./job_stages.js";
 import { Workers } from "./job_workers.js";
 
+/** @import { Job, Progress } from "./api.js" */
+
 const RESULTS_MS = 3000; // between two looks at the results, at least
 const POINTS = 600;
 
-const at = (id) => document.getElementById(id);
-const id = document.body.dataset.job;
+const id = document.body.dataset.job ?? "";
 const stages = new Stages(at("stages"), at("stages-total"));
 const throughput = new Throughput(at("speed"));
 const charts = new FrameCharts({ accepted: at("accepted"), drift: at("drift"), note: at("accepted-note") });
 const workers = new Workers(at("workers"));
 const log = new Log(at("log"));
-const picture = new JobPicture({ element: at("picture"), scale: at("scale"), pointed: at("pointed"), title: at("picture-title"), select: at("colour-by") }, id);
-let job = null;
+const picture = new JobPicture({ element: at("picture"), scale: at("scale"), pointed: at("pointed"), title: at("picture-title"), select: at("colour-by", HTMLSelectElement) }, id);
+/** @type {Job} */
+let job; // once it is read
 
-const stageState = (name) => job.progress.stages?.[name]?.state ?? "pending";
+const stageState = (/** @type {string} */ name) => job.progress.stages?.[name]?.state ?? "pending";
 const isPast = (name) => ["done", "reused"].includes(stageState(name));
 /** Whether there is a summed image: a stage is done a moment before its store is. */
 const hasSum = () => isPast("sum") && (stageState("columns") !== "pending" || job.state !== "running");
@@ -89,16 +91,18 @@ function showProgress() {
   const kind = { done: "good", done_with_failed_frames: "warn", failed: "bad", cancelled: "still", waiting_for_columns: "warn" }[state] ?? "";
   setAttribute(at("bar"), "class", `bar large ${kind}`);
   setAttribute(at("bar"), "aria-valuenow", Math.round(fraction * 100));
-  at("bar").firstElementChild.style.setProperty("--done", fraction);
+  find(":scope > *", undefined, at("bar")).style.setProperty("--done", String(fraction));
   const running = state === "running";
+  /** @type {[name: string, value: string][]} */
   const figures = isDone(state)
-    ? [["Frames", count(outcome.frames)], ["Columns", count(outcome.columns)], ["Fits", count(outcome.fits)], ["Accepted", outcome.fits ? percent(outcome.accepted / outcome.fits) : "–"], ["Took", job.started && job.ended ? duration(between(job.started, job.ended)) : "–"]]
-    : !running ? [] : [["Time left", Number.isFinite(progress.seconds_left) ? left(progress.seconds_left) : "–"], ["Frames/s", progress.frames_per_s ? rate(progress.frames_per_s) : "–"], ["Fits/s", progress.fits_per_s ? rate(progress.fits_per_s) : "–"], ["Running for", job.started ? duration(Math.round(between(job.started))) : "–"]];
+    ? [["Frames", count(outcome.frames)], ["Columns", count(outcome.columns)], ["Fits", count(outcome.fits)], ["Accepted", outcome.fits ? percent((outcome.accepted ?? NaN) / outcome.fits) : "–"], ["Took", job.started && job.ended ? duration(between(job.started, job.ended)) : "–"]]
+    : !running ? [] : [["Time left", progress.seconds_left !== undefined && Number.isFinite(progress.seconds_left) ? left(progress.seconds_left) : "–"], ["Frames/s", progress.frames_per_s ? rate(progress.frames_per_s) : "–"], ["Fits/s", progress.fits_per_s ? rate(progress.fits_per_s) : "–"], ["Running for", job.started ? duration(Math.round(between(job.started))) : "–"]];
   showFigures(figures);
   stages.show(job);
   document.title = `${running ? `${percent(fraction, 0)} · ` : ""}${nameOf(job)} · tract_dask`;
 }
 
+/** @param {[name: string, value: string][]} figures */
 function showFigures(figures) {
   const names = figures.map(([name]) => name).join(), place = at("figures");
   place.hidden = figures.length === 0;
@@ -106,7 +110,7 @@ function showFigures(figures) {
     place.dataset.names = names;
     place.replaceChildren(...figures.map(([name]) => h("div", {}, h("dt", {}, name), h("dd", {}))));
   }
-  figures.forEach(([, value], index) => setText(place.children[index].lastChild, value));
+  figures.forEach(([, value], index) => setText(/** @type {Node} */ (place.children[index].lastChild), value));
 }
 
 function showAbout() {
@@ -117,7 +121,7 @@ function showAbout() {
   at("about").replaceChildren(...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
 }
 
-let defaults = null;
+let defaults = /** @type {Map<string, any> | null} */ (null);
 function isChanged(group, name, value) {
   const known = defaults?.get(`${group}.${name}`);
   return defaults !== null && JSON.stringify(known) !== JSON.stringify(value);
@@ -140,7 +144,7 @@ function showMade() {
 let looked = 0, looking = 0, fitted = "";
 /** Read what the finished shards say: soon, not too often, and only while somebody looks. */
 function lookAtResults() {
-  const now = [job.progress.stages.fit.done_frames, stageState("fit"), job.state].join();
+  const now = [job.progress.stages?.fit?.done_frames, stageState("fit"), job.state].join();
   if (looking || now === fitted) return;
   looking = setTimeout(async () => {
     if (!document.hidden) {
@@ -156,6 +160,7 @@ function lookAtResults() {
   }, Math.max(0, RESULTS_MS - (performance.now() - looked)));
 }
 
+/** @param {Job} changed */
 function onJob(changed) {
   if (changed.deleted) {
     at("call").replaceChildren(h("div", { class: "notice" }, h("div", {}, h("h2", {}, "This job was deleted"), h("a", { href: "/" }, "To the list of jobs"))));
@@ -169,6 +174,7 @@ function onJob(changed) {
   showMade();
 }
 
+/** @param {Progress} progress */
 function onProgress(progress) {
   job.progress = progress;
   throughput.add(progress);
@@ -189,15 +195,15 @@ document.addEventListener("visibilitychange", () => { if (job && !document.hidde
 
 at("rename").addEventListener("click", () => {
   const field = h("input", { class: "input", maxlength: 200, value: job.label, "aria-label": "Label" });
-  const end = () => { field.replaceWith(at("rename").previous); at("rename").hidden = false; at("rename").focus(); };
+  const before = at("name");
+  const end = () => { field.replaceWith(before); at("rename").hidden = false; at("rename").focus(); };
   const save = async () => {
     try { onJob(await post(`/jobs/${id}/label`, { label: field.value.trim() })); } catch (error) { toast(error); }
     end();
   };
   field.addEventListener("keydown", (event) => { if (event.key === "Enter") save(); if (event.key === "Escape") end(); });
-  at("rename").previous = at("name");
   at("rename").hidden = true;
-  at("name").replaceWith(field);
+  before.replaceWith(field);
   field.select();
   field.focus();
 });

@@ -7,6 +7,19 @@ import { percent, significant } from "./format.js";
 import { ImageView } from "./image_view.js";
 import { scaleOf, viridis } from "./number_colours.js";
 
+/**
+ * @import { Levels } from "./api.js"
+ * @import { Scale } from "./number_colours.js"
+ * @import { Box, Point } from "./image_view.js"
+ * @typedef {{ column_id: number, x: number, y: number, kind: string, [name: string]: any }} Column
+ * @typedef {object} Places
+ * @property {HTMLElement} element
+ * @property {HTMLElement} scale
+ * @property {HTMLElement} pointed
+ * @property {HTMLElement} title
+ * @property {HTMLSelectElement} select
+ */
+
 const AGAIN_MS = 1500;
 const TRIES = 5; // a store that was just written may not be seen at once
 const CLICK_PX = 4;
@@ -14,14 +27,34 @@ const HIT_PX = 14;
 
 export class JobPicture {
   /**
-   * @param places { element, scale, pointed, title, select }
-   * @param job its id; `pixelSizePm` is set where its settings have one
+   * @param {Places} places
+   * @param {string} job its id; `pixelSizePm` is set where its settings have one
    */
-  constructor(places, job) {
-    Object.assign(this, places, { job, pixelSizePm: null, columns: [], values: null, shown: "", spacing: 40 });
+  constructor({ element, scale, pointed, title, select }, job) {
+    this.element = element;
+    this.pointed = pointed;
+    this.title = title;
+    this.select = select;
+    this.job = job;
+    /** @type {number | null} */
+    this.pixelSizePm = null;
+    /** @type {Column[]} */
+    this.columns = [];
+    /** @type {{ columns: Column[], unit: string } | null} */
+    this.values = null;
+    /** @type {Column | null} */
+    this.under = null; // the pointer
+    /** @type {[number, number] | null} */
+    this.down = null; // where the pointer was pressed
+    /** @type {Scale | null} */
+    this.colours = null;
+    /** @type {ImageView | null} */
+    this.view = null;
+    this.shown = "";
+    this.spacing = 40;
     this.hint = h("div", { class: "hint" }, "Reading …");
     this.element.append(this.hint);
-    this.bar = new ColourBar(this.scale);
+    this.bar = new ColourBar(scale);
     this.select.addEventListener("change", () => this.colour());
     this.element.addEventListener("pointerdown", (event) => { this.down = [event.clientX, event.clientY]; });
     this.element.addEventListener("click", (event) => this.clicked(event));
@@ -43,7 +76,15 @@ export class JobPicture {
     else await this.showFrame();
   }
 
+  /**
+   * @param {string} kind
+   * @param {string} about
+   * @param {string} picture
+   * @param {Record<string, any>} query
+   * @param {string} title
+   */
   async load(kind, about, picture, query, title) {
+    /** @type {Levels & { version: string, shape: [number, number], pixel_size_pm: number | null }} */
     let levels;
     try { levels = await get(about, query); } catch (error) {
       if (error.status !== 404 || kind === "frame") setText(this.hint, error.what || "The picture cannot be shown");
@@ -54,9 +95,9 @@ export class JobPicture {
     setText(this.title, title);
     this.hint.hidden = true;
     const contrast = { low: levels.percentiles["0.5"], high: levels.percentiles["99.5"] };
-    if (contrast.low === contrast.high) Object.assign(contrast, { low: levels.range[0], high: levels.range[1] });
+    if (contrast.low === contrast.high && levels.range) Object.assign(contrast, { low: levels.range[0], high: levels.range[1] });
     const [height, width] = levels.shape;
-    const address = (box, wide) => url(picture, { ...query, ...contrast, v: levels.version, box: [box.x0, box.y0, box.x1, box.y1].join(), width: wide });
+    const address = (/** @type {Box} */ box, /** @type {number} */ wide) => url(picture, { ...query, ...contrast, v: levels.version, box: [box.x0, box.y0, box.x1, box.y1].join(), width: wide });
     const image = { width, height, pixelSizePm: this.pixelSizePm ?? levels.pixel_size_pm };
     if (this.view) {
       this.view.options.url = address;
@@ -86,7 +127,7 @@ export class JobPicture {
 
   /** Back to the columns without values, as another try begins. */
   forget() {
-    Object.assign(this, { values: null, columns: [], shown: "" });
+    [this.values, this.columns, this.shown] = [null, [], ""];
     this.colour();
   }
 
@@ -108,18 +149,20 @@ export class JobPicture {
     }
   }
 
+  /** @param {Point | null} point */
   hover(point) {
     const found = point && this.nearest(point);
     if (found !== this.under) {
       this.under = found;
       this.element.toggleAttribute("data-on-column", Boolean(found && this.values));
-      this.view.redraw();
+      this.view?.redraw();
     }
     setText(this.pointed, found ? this.describe(found) : "");
   }
 
+  /** @param {Point} point */
   nearest(point) {
-    let best = null, least = HIT_PX / this.view.scale;
+    let best = /** @type {Column | null} */ (null), least = HIT_PX / (this.view?.scale ?? 1);
     for (const one of this.columns) {
       const away = Math.hypot(one.x - point.x, one.y - point.y);
       if (away < least) [best, least] = [one, away];
@@ -127,6 +170,7 @@ export class JobPicture {
     return best;
   }
 
+  /** @param {Column} one */
   describe(one) {
     const parts = [`Column ${one.column_id}${one.kind ? ` (${one.kind})` : ""}`];
     if (this.values) {
@@ -142,7 +186,11 @@ export class JobPicture {
   }
 }
 
-/** A scale for shares: its end is 1, so that all that is accepted looks the same in every job. */
+/**
+ * A scale for shares: its end is 1, so that all that is accepted looks the same in every job.
+ * @param {(number | null)[]} values
+ * @returns {Scale}
+ */
 function shareScale(values) {
   const low = Math.min(0.5, ...values.filter((value) => value !== null));
   return { low, high: 1, more: false, colour: (value) => viridis((value - low) / (1 - low)) };

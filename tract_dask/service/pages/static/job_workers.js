@@ -5,8 +5,22 @@ import { bytes, percent, STAGES } from "./format.js";
 
 const HIGH = 0.8; // of the limit: distributed begins to write to disk at 0.7, and stops work at 0.8
 
+/**
+ * @typedef {object} Worker as the API tells it
+ * @property {string} name
+ * @property {string} address
+ * @property {number} cpu percent of one processor
+ * @property {number} memory bytes
+ * @property {number | null} memory_limit
+ * @property {number} executing tasks
+ * @property {keyof typeof STAGES} stage
+ * @typedef {{ element: HTMLElement, update: (worker: Worker) => void }} Row
+ */
+
 export class Workers {
+  /** @param {HTMLElement} element */
   constructor(element) {
+    /** @type {Map<string, Row>} */
     this.rows = new Map();
     this.body = h("tbody", {});
     this.empty = h("p", { class: "muted small" }, "No worker is there yet.");
@@ -16,14 +30,15 @@ export class Workers {
     this.show([]);
   }
 
+  /** @param {Worker[]} workers */
   show(workers) {
     const sorted = [...workers].sort((one, other) => one.name.localeCompare(other.name, "en", { numeric: true }));
-    for (const address of this.rows.keys()) {
-      if (!sorted.some((worker) => worker.address === address)) { this.rows.get(address).element.remove(); this.rows.delete(address); }
+    for (const [address, { element }] of this.rows) {
+      if (!sorted.some((worker) => worker.address === address)) { element.remove(); this.rows.delete(address); }
     }
     sorted.forEach((worker, index) => {
-      if (!this.rows.has(worker.address)) this.rows.set(worker.address, row(worker));
-      const one = this.rows.get(worker.address);
+      const one = this.rows.get(worker.address) ?? row(worker);
+      this.rows.set(worker.address, one);
       if (this.body.children[index] !== one.element) this.body.insertBefore(one.element, this.body.children[index] ?? null);
       one.update(worker);
     });
@@ -32,6 +47,10 @@ export class Workers {
   }
 }
 
+/**
+ * @param {Worker} worker
+ * @returns {Row}
+ */
 function row({ name, address }) {
   const doing = h("td", {}), meters = ["Processor", "Memory"].map((what) => meter(`${what} of worker ${name}`));
   const element = h("tr", {}, h("td", { title: address }, name), doing, ...meters.map((one) => one.element));
@@ -46,16 +65,21 @@ function row({ name, address }) {
   };
 }
 
+/** @param {string} label */
 function meter(label) {
   const text = h("span", { class: "tabular" }), fill = h("span", {});
   const bar = h("div", { class: "bar", role: "meter", "aria-label": label, "aria-valuemin": 0, "aria-valuemax": 100 }, fill);
   return {
     element: h("td", { class: "meter" }, text, bar),
+    /**
+     * @param {number} share
+     * @param {string} words
+     */
     update(share, words, kind = "") {
       setText(text, words);
       setAttribute(bar, "class", `bar ${kind}`);
       setAttribute(bar, "aria-valuenow", Math.round(Math.min(share, 1) * 100));
-      fill.style.setProperty("--done", Math.min(share, 1));
+      fill.style.setProperty("--done", String(Math.min(share, 1)));
     },
   };
 }

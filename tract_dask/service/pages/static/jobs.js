@@ -1,11 +1,17 @@
 // The list of jobs: one row a job, made once and then updated in place as events come.
 
 import { get, subscribe, toast } from "./api.js";
-import { h, setAttribute, setText } from "./dom.js";
+import { at, h, setAttribute, setText } from "./dom.js";
 import { count, duration, fullTime, hasEnded, isDone, left, moment, nameOf, percent, rate, several, between, STAGES, STATES } from "./format.js";
 import { actionButton, actionsOf, isCancelling } from "./job_actions.js";
 
+/**
+ * @import { Job, Progress } from "./api.js"
+ * @typedef {{ name: string, title: string, states?: string[] }} Group
+ */
+
 const ACTIVE = ["running", "waiting_for_columns"];
+/** @type {Group[]} */
 const GROUPS = [
   { name: "", title: "All" },
   { name: "running", title: "Running", states: ["running"] },
@@ -17,20 +23,24 @@ const GROUPS = [
 ];
 const PAGE = 50;
 
-const at = (id) => document.getElementById(id);
-const [list, active, others, nothing, olderRow, said] = ["list", "active", "others", "nothing", "older-row", "said"].map(at);
+const [list, active, others, nothing, olderRow, said] = ["list", "active", "others", "nothing", "older-row", "said"].map((id) => at(id));
 const address = new URLSearchParams(location.search);
 const filter = { group: address.get("state") ?? "", owner: address.get("owner") ?? "", text: address.get("text") ?? "" };
-const rows = new Map(); // id -> Row
+/** @type {Map<string, Row>} */
+const rows = new Map(); // by id
+/** @type {Set<string>} */
 const owners = new Set();
-let next = null, counts = {}, generation = 0;
+let next = /** @type {number | null} */ (null), counts = /** @type {Record<string, number>} */ ({}), generation = 0;
 
 const group = () => GROUPS.find((one) => one.name === filter.group) ?? GROUPS[0];
 const states = () => group().states ?? [];
 
 /** One job's row; `update` touches only what changed. */
 class Row {
+  /** @param {Job} job */
   constructor(job) {
+    this.job = job;
+    this.drawn = "";
     this.badge = h("span", { class: "badge" });
     this.name = h("a", { class: "name", href: `/jobs/${job.id}` });
     this.path = h("bdi", { dir: "ltr" });
@@ -54,6 +64,7 @@ class Row {
     this.update(job);
   }
 
+  /** @param {Job} job */
   update(job) {
     this.job = job;
     const name = nameOf(job);
@@ -72,13 +83,14 @@ class Row {
     this.updateActions();
   }
 
+  /** @param {Progress} progress */
   updateProgress(progress) {
     const { job } = this;
     job.progress = progress;
     const { fraction = 0 } = progress, running = job.state === "running";
     this.bar.hidden = isDone(job.state);
     setText(this.result, isDone(job.state) ? resultText(job.outcome) : "");
-    this.fill.style.setProperty("--done", fraction);
+    this.fill.style.setProperty("--done", String(fraction));
     setAttribute(this.bar, "class", `bar ${barKind(job)}`);
     setAttribute(this.bar, "aria-valuenow", Math.round(fraction * 100));
     setAttribute(this.bar, "aria-label", `Progress of ${nameOf(job)}`);
@@ -101,41 +113,48 @@ class Row {
     const links = [];
     if (job.state === "waiting_for_columns") links.push(h("a", { class: "button small primary", href: `/jobs/${job.id}/columns` }, "Check columns"));
     if (isDone(job.state)) links.push(h("a", { class: "button small", href: `/jobs/${job.id}/results` }, "Results"));
-    const buttons = actions.map((action) => actionButton(job, action, (done) => done === "delete" && drop(job.id)));
+    const buttons = actions.map((action) => actionButton(job, action, (done) => { if (done === "delete") drop(job.id); }));
     this.actions.replaceChildren(...links, ...buttons);
   }
 }
 
+/** @param {Job} job */
 function barKind(job) {
   return { done: "good", done_with_failed_frames: "warn", failed: "bad", cancelled: "still", waiting_for_columns: "warn" }[job.state] ?? "";
 }
 
+/** @param {Job} job */
 function whereText(job) {
   const { progress, outcome, state } = job;
   if (state === "failed") return job.reason || "Failed";
   if (state === "cancelled") return job.reason || "Cancelled";
   if (state === "waiting_for_columns") return "Check the columns to go on";
   if (state === "queued") return job.reason && job.attempts ? `In the queue: ${job.reason}` : "In the queue";
-  if (isDone(state)) return outcome.fits ? `${percent(outcome.accepted / outcome.fits)} of ${rate(outcome.fits)} fits accepted` : "";
+  if (isDone(state)) return outcome.fits ? `${percent((outcome.accepted ?? NaN) / outcome.fits)} of ${rate(outcome.fits)} fits accepted` : "";
   const stage = STAGES[progress.stage || job.stage] ?? "Starting";
   return progress.frames ? `${stage} · ${count(progress.done_frames)} of ${several(progress.frames, "frame")}` : stage;
 }
 
+/** @param {Job["outcome"]} outcome */
 function resultText({ frames, columns, bad_frames: bad }) {
   const parts = [bad && `${several(bad, "frame")} failed`, frames && several(frames, "frame"), columns && several(columns, "column")];
   return parts.filter(Boolean).join(" · ");
 }
 
+/** @param {Job} job */
 function timeTexts(job) {
   if (job.state === "running") {
     const { seconds_left: seconds, fraction } = job.progress;
-    return [Number.isFinite(seconds) ? left(seconds) : "", Number.isFinite(seconds) ? "left" : fraction ? percent(fraction, 0) : ""];
+    return [seconds !== undefined && Number.isFinite(seconds) ? left(seconds) : "", Number.isFinite(seconds) ? "left" : fraction ? percent(fraction, 0) : ""];
   }
   if (hasEnded(job.state) && job.started && job.ended) return [duration(between(job.started, job.ended)), "taken"];
   return ["", ""];
 }
 
-/** Put a job's row where it belongs: those that need eyes first where all are shown, then the newest first. */
+/**
+ * Put a job's row where it belongs: those that need eyes first where all are shown, then the newest first.
+ * @param {Job} job
+ */
 function place(job, fresh = false) {
   if (!matches(job)) { drop(job.id); return; }
   let row = rows.get(job.id);
@@ -146,18 +165,20 @@ function place(job, fresh = false) {
     if (fresh) row.element.classList.add("new");
   }
   const body = !group().states && ACTIVE.includes(job.state) ? active : others;
-  const neighbours = [...body.children].filter((one) => one !== row.element);
-  const after = neighbours.find((one) => rows.get(one.dataset.job).job.number < job.number) ?? null;
-  if (row.element.parentElement !== body || row.element.nextElementSibling !== after) body.insertBefore(row.element, after);
+  const { element } = row, neighbours = /** @type {HTMLElement[]} */ ([...body.children]).filter((one) => one !== element);
+  const after = neighbours.find((one) => (rows.get(one.dataset.job ?? "")?.job.number ?? Infinity) < job.number) ?? null;
+  if (element.parentElement !== body || element.nextElementSibling !== after) body.insertBefore(element, after);
   if (!owners.has(job.owner)) { owners.add(job.owner); showOwners(); }
   showNothing();
 }
 
+/** @param {string} id */
 function drop(id) {
   rows.get(id)?.element.remove();
   if (rows.delete(id)) showNothing();
 }
 
+/** @param {Job} job */
 function matches(job) {
   const text = filter.text.toLowerCase();
   return (!states().length || states().includes(job.state)) && (!filter.owner || job.owner === filter.owner)
@@ -193,7 +214,7 @@ async function load() {
 }
 
 async function loadOlder() {
-  const button = at("older"), mine = generation;
+  const button = at("older", HTMLButtonElement), mine = generation;
   button.disabled = true;
   try {
     const page = await get("/jobs", { ...query(), state: states(), limit: PAGE, before: next });
@@ -205,6 +226,7 @@ async function loadOlder() {
   button.disabled = false;
 }
 
+/** @param {Job} job */
 function onJob(job) {
   if (job.deleted) { drop(job.id); recount(); return; }
   const before = rows.get(job.id)?.job;
@@ -215,6 +237,7 @@ function onJob(job) {
   if (before) setText(said, `${nameOf(job)}: ${STATES[job.state]}`);
 }
 
+/** @param {Progress} progress */
 function onProgress(progress) {
   const row = rows.get(progress.job);
   if (row) row.updateProgress(progress);
@@ -237,7 +260,7 @@ at("states").append(...[...stateButtons.values()].map(({ button }) => button));
 
 function showStates() {
   for (const one of GROUPS) {
-    const { button, number } = stateButtons.get(one.name);
+    const { button, number } = /** @type {{ button: HTMLElement, number: HTMLElement }} */ (stateButtons.get(one.name));
     const total = (one.states ?? Object.keys(STATES)).reduce((sum, state) => sum + (counts[state] ?? 0), 0);
     setText(number, count(total));
     setAttribute(button, "aria-pressed", String(one.name === group().name));
@@ -268,10 +291,11 @@ function lattice() {
   return h("img", { src: "/static/logo.svg", width: 56, height: 56, alt: "" });
 }
 
+/** @param {Partial<typeof filter>} changes */
 function choose(changes) {
   Object.assign(filter, changes);
-  at("text").value = filter.text;
-  at("owner").value = filter.owner;
+  at("text", HTMLInputElement).value = filter.text;
+  at("owner", HTMLSelectElement).value = filter.owner;
   const shown = new URLSearchParams(Object.entries({ state: filter.group, owner: filter.owner, text: filter.text }).filter(([, value]) => value));
   history.replaceState(null, "", shown.size ? `?${shown}` : location.pathname);
   showStates();
@@ -279,12 +303,12 @@ function choose(changes) {
 }
 
 let typing = 0;
-at("text").value = filter.text;
-at("text").addEventListener("input", (event) => {
+at("text", HTMLInputElement).value = filter.text;
+at("text").addEventListener("input", () => {
   clearTimeout(typing);
-  typing = setTimeout(() => choose({ text: event.target.value.trim() }), 250);
+  typing = setTimeout(() => choose({ text: at("text", HTMLInputElement).value.trim() }), 250);
 });
-at("owner").addEventListener("change", (event) => choose({ owner: event.target.value }));
+at("owner").addEventListener("change", () => choose({ owner: at("owner", HTMLSelectElement).value }));
 at("filters").addEventListener("submit", (event) => event.preventDefault());
 at("older").addEventListener("click", loadOlder);
 showOwners();

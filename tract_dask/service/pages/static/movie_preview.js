@@ -6,10 +6,21 @@ import { h, setAttribute, setText } from "./dom.js";
 import { count, duration } from "./format.js";
 import { ImageView } from "./image_view.js";
 
+/** @import { Movie } from "./api.js" */
+
 const PLAY_MS = 80; // between frames, at least
 
 export class MoviePreview {
+  /** @param {HTMLElement} element */
   constructor(element) {
+    /** @type {Movie | null} */
+    this.about = null; // the movie that is shown
+    /** @type {Record<string, any>} */
+    this.reading = {};
+    this.frames = this.frame = this.asked = this.settling = this.timer = 0;
+    this.playing = false;
+    /** @type {ImageView | null} */
+    this.view = null;
     this.image = h("div", { class: "image", role: "img", "aria-label": "A frame of the movie: drag to move, wheel to zoom" });
     this.slider = h("input", { type: "range", min: 0, value: 0, step: 1, "aria-label": "Frame", oninput: () => this.go(Number(this.slider.value)) });
     this.place = h("output", {});
@@ -25,12 +36,15 @@ export class MoviePreview {
     });
   }
 
-  /** Show a movie: `about` as the API tells it, `reading` the parameters of a raw file. */
+  /**
+   * Show a movie: `about` as the API tells it, `reading` the parameters of a raw file.
+   * @param {Movie} about
+   */
   show(about, reading = {}) {
     const [frames, height, width] = about.shape;
-    Object.assign(this, { about, reading, frames, frame: 0, playing: false });
+    [this.about, this.reading, this.frames, this.frame, this.playing] = [about, reading, frames, 0, false];
     this.contrast.chosen = null;
-    this.slider.max = frames - 1;
+    this.slider.max = String(frames - 1);
     this.view?.close();
     this.view = null;
     this.showPlace();
@@ -45,12 +59,15 @@ export class MoviePreview {
     }).catch((error) => toast(error));
   }
 
-  /** Take another pixel size for the scale bar. */
+  /**
+   * Take another pixel size for the scale bar.
+   * @param {number | null} pixelSizePm
+   */
   setPixelSize(pixelSizePm) {
-    this.view?.setImage({ width: this.about.shape[2], height: this.about.shape[1], pixelSizePm });
+    if (this.about) this.view?.setImage({ width: this.about.shape[2], height: this.about.shape[1], pixelSizePm });
   }
 
-  query() { return { path: this.about.path, frame: this.frame, ...this.reading }; }
+  query() { return { path: this.about?.path, frame: this.frame, ...this.reading }; }
 
   async readLevels() {
     const { about, frame } = this;
@@ -58,9 +75,10 @@ export class MoviePreview {
     if (this.about === about && this.frame === frame) this.contrast.setLevels(levels);
   }
 
+  /** @param {number} frame */
   go(frame) {
     this.frame = Math.min(Math.max(frame, 0), this.frames - 1);
-    this.slider.value = this.frame;
+    this.slider.value = String(this.frame);
     this.showPlace();
     this.view?.reload();
     clearTimeout(this.settling);
@@ -68,7 +86,7 @@ export class MoviePreview {
   }
 
   showPlace() {
-    const { frame_time_s: step } = this.about;
+    const step = this.about?.frame_time_s;
     const text = `Frame ${count(this.frame)} of 0–${count(this.frames - 1)}${step ? ` · ${duration(this.frame * step)}` : ""}`;
     setText(this.place, text);
     setAttribute(this.slider, "aria-valuetext", text);

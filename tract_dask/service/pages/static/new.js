@@ -1,19 +1,25 @@
 // A new job: choose a movie, look at it, set what needs setting, see what it takes, submit.
 
 import { get, post, toast } from "./api.js";
-import { h, setText } from "./dom.js";
+import { at, h, setText } from "./dom.js";
 import { FolderBrowser } from "./folder_browser.js";
 import { bytes, count, duration, left, nameOf, significant, several } from "./format.js";
 import { MoviePreview } from "./movie_preview.js";
 import { SettingsForm } from "./settings_form.js";
 
+/**
+ * @import { Job, Movie } from "./api.js"
+ * @typedef {Record<string, Record<string, any>>} Values of settings, by group and name
+ */
+
 const IMPORTANT = ["fit.estimator", "fit.shape", "fit.window_px", "drift.method", "columns.method", "columns.contrast"];
 const WAIT_MS = 350; // after the last change, before the plan is made anew
 
-const at = (id) => document.getElementById(id);
 const preview = new MoviePreview(at("preview"));
 const browser = new FolderBrowser(at("browser"), { onMovie: (path) => choose(path), onFolder: (path) => go({ folder: path }) });
-let form = null, source = "", about = null, planning = 0;
+/** @type {SettingsForm} */
+let form; // once the settings are declared
+let source = "", about = /** @type {Movie | null} */ (null), planning = 0;
 
 function go(parameters) {
   const query = new URLSearchParams(Object.entries(parameters).filter(([, value]) => value));
@@ -27,10 +33,11 @@ async function arrive() {
   const template = query.get("from");
   if (template) {
     try {
+      /** @type {Job} */
       const job = await get(`/jobs/${template}`);
       form.set(job.settings);
-      at("label").value = job.label;
-      at("curate").checked = job.curate;
+      at("label", HTMLInputElement).value = job.label;
+      at("curate", HTMLInputElement).checked = job.curate;
       history.replaceState(null, "", `?${new URLSearchParams({ source: job.source })}`);
       toast(`The settings are those of “${nameOf(job)}”.`);
       await choose(job.source, false);
@@ -67,36 +74,41 @@ async function readMovie() {
   const path = source, reading = readingOf(form.values() ?? {});
   at("source-problem").replaceChildren();
   try {
+    /** @type {Movie} */
     const found = await get("/files/about", { path, ...reading });
     if (source !== path) return;
     about = found;
     at("preview").hidden = false;
-    const [frames, height, width] = about.shape;
-    setText(at("source-facts"), [path.split("/").slice(0, -1).join("/"), several(frames, "frame"), `${count(width)} × ${count(height)} px`, about.dtype, bytes(about.bytes), about.format + (about.files > 1 ? `, ${several(about.files, "file")}` : "")].filter(Boolean).join(" · "));
-    preview.show(about, { ...reading, raw_shape: reading.raw_shape?.join() });
-    showMetadata();
+    const [frames, height, width] = found.shape;
+    setText(at("source-facts"), [path.split("/").slice(0, -1).join("/"), several(frames, "frame"), `${count(width)} × ${count(height)} px`, found.dtype, bytes(found.bytes), found.format + (found.files > 1 ? `, ${several(found.files, "file")}` : "")].filter(Boolean).join(" · "));
+    preview.show(found, { ...reading, raw_shape: reading.raw_shape?.join() });
+    showMetadata(found);
   } catch (error) {
     if (source !== path) return;
     at("preview").hidden = true;
     setText(at("source-facts"), "");
     at("source-problem").replaceChildren(h("div", { class: "notice bad", role: "alert" }, h("p", {}, h("b", {}, error.what)), error.expected && h("p", { class: "small" }, `Expected ${error.expected}${error.got ? `; got ${error.got}` : ""}`), h("p", {}, error.remedy)));
-    if (/raw/i.test(error.text ?? error.message)) at("group-source").open = true;
+    if (/raw/i.test(error.text ?? error.message)) at("group-source", HTMLDetailsElement).open = true;
   }
   plan();
 }
 
-/** The part of the settings that says how a raw file is read. */
+/**
+ * The part of the settings that says how a raw file is read.
+ * @param {Values} values
+ */
 function readingOf(values) {
   const { raw_shape, raw_dtype, raw_offset } = values.source ?? {};
   return { raw_shape, raw_dtype, raw_offset };
 }
 
-function showMetadata() {
-  const known = (value, digits = 4) => (value === null ? "unknown" : significant(value, digits));
-  for (const [name, value] of Object.entries({ pixel_size_pm: about.pixel_size_pm, frame_time_s: about.frame_time_s, dose: about.dose, gain: about.gain })) form.get(`metadata.${name}`).setPlaceholder(known(value));
-  const missing = [[about.pixel_size_pm, "pixel size", "results stay in px"], [about.frame_time_s, "frame time", "time is in frames"]]
+/** @param {Movie} movie */
+function showMetadata({ pixel_size_pm, frame_time_s, dose, gain, warnings }) {
+  const known = (/** @type {number | null} */ value, digits = 4) => (value === null ? "unknown" : significant(value, digits));
+  for (const [name, value] of Object.entries({ pixel_size_pm, frame_time_s, dose, gain })) form.get(`metadata.${name}`)?.setPlaceholder(known(value));
+  const missing = [[pixel_size_pm, "pixel size", "results stay in px"], [frame_time_s, "frame time", "time is in frames"]]
     .filter(([value, , ]) => value === null).map(([, what, then]) => `no ${what} (${then})`);
-  const notes = [...about.warnings];
+  const notes = [...warnings];
   if (missing.length) notes.unshift(`The file has ${missing.join(" and ")}, unless you give it here.`);
   at("metadata-note").replaceChildren(...notes.map((note) => h("div", { class: "notice warn" }, note)));
   at("metadata-note").hidden = notes.length === 0;
@@ -109,7 +121,7 @@ function onChange() {
   waiting = setTimeout(() => {
     const values = form.values();
     const reading = JSON.stringify(values && readingOf(values));
-    preview.about && preview.setPixelSize(values?.metadata?.pixel_size_pm ?? about?.pixel_size_pm ?? null);
+    preview.setPixelSize(values?.metadata?.pixel_size_pm ?? about?.pixel_size_pm ?? null);
     if (values && reading !== read) { read = reading; if (source) readMovie(); } else plan();
   }, WAIT_MS);
 }
@@ -117,7 +129,7 @@ function onChange() {
 /** Ask what the job will take, and show it. */
 async function plan() {
   const mine = ++planning, values = form.values();
-  if (!values || !about) at("submit").disabled = true; // otherwise it stays as it is: a click shall not be lost
+  if (!values || !about) at("submit", HTMLButtonElement).disabled = true; // otherwise it stays as it is: a click shall not be lost
   if (!values) { showPlanNote("warn", "A setting is wrong; its field says what."); return; }
   if (!about) { at("plan-body").replaceChildren(h("span", { class: "muted" }, "The plan follows when the movie can be read.")); return; }
   at("plan").setAttribute("aria-busy", "true");
@@ -125,10 +137,10 @@ async function plan() {
     const found = await post("/plan", { source, settings: values });
     if (mine !== planning) return;
     showPlan(found);
-    at("submit").disabled = false;
+    at("submit", HTMLButtonElement).disabled = false;
   } catch (error) {
     if (mine !== planning) return;
-    at("submit").disabled = true;
+    at("submit", HTMLButtonElement).disabled = true;
     const beside = form.showRefused(error);
     showPlanNote("bad", error.what, beside ? "See the field that is marked." : [error.where, error.expected && `expected ${error.expected}`, error.got && `got ${error.got}`].filter(Boolean).join("; "), beside ? "" : error.remedy);
   }
@@ -157,13 +169,13 @@ async function submit(event) {
   if (!values || !about) return;
   clearTimeout(waiting);
   planning += 1; // a plan that is on its way is not waited for: the service checks the job once more
-  at("submit").disabled = true;
+  at("submit", HTMLButtonElement).disabled = true;
   try {
-    const job = await post("/jobs", { source, settings: values, label: at("label").value.trim(), curate: at("curate").checked });
+    const job = await post("/jobs", { source, settings: values, label: at("label", HTMLInputElement).value.trim(), curate: at("curate", HTMLInputElement).checked });
     location.assign(`/jobs/${job.id}`);
   } catch (error) {
     if (!form.showRefused(error)) toast(error);
-    at("submit").disabled = false;
+    at("submit", HTMLButtonElement).disabled = false;
   }
 }
 

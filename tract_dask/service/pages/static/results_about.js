@@ -1,12 +1,21 @@
 // How it was measured: what is known of the movie, versions, and every setting.
 
-import { get } from "/static/api.js";
-import { h } from "/static/dom.js";
-import { count, fullTime, significant } from "/static/format.js";
+import { get } from "./api.js";
+import { at, h } from "./dom.js";
+import { count, fullTime, significant } from "./format.js";
 
-let declared = null;
+/**
+ * @import { Job, Summary } from "./api.js"
+ * @import { Declared } from "./settings_form.js"
+ */
 
-/** Show where the results come from. */
+let declared = /** @type {Declared[] | { settings: Declared[] } | null} */ (null);
+
+/**
+ * Show where the results come from.
+ * @param {Summary} summary
+ * @param {Job} record
+ */
 export async function showProvenance(summary, record) {
   const known = (value, unit) => (value ? `${significant(value, 4)} ${unit}` : "not known");
   const facts = [
@@ -19,11 +28,12 @@ export async function showProvenance(summary, record) {
     ["Folder", record.output],
     ["Versions", Object.entries(summary.versions).map(([name, version]) => `${name} ${version}`).join(", ")],
   ];
-  document.getElementById("facts").replaceChildren(...facts.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value ?? "–")]));
+  at("facts").replaceChildren(...facts.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value ?? "–")]));
   declared ??= await get("/settings").catch(() => null);
-  document.getElementById("settings").replaceChildren(...settingRows(summary.settings));
+  at("settings").replaceChildren(...settingRows(summary.settings));
 }
 
+/** @param {Summary["settings"]} settings */
 function settingRows(settings) {
   const rows = Array.isArray(declared) ? declared : declared?.settings ?? [];
   const about = new Map(rows.map((row) => [`${row.group}.${row.name}`, row]));

@@ -1,8 +1,8 @@
 // Downloads: a Zarr store at once; other formats when the service has made the file.
 
-import { get, toast, url } from "/static/api.js";
-import { h, setText } from "/static/dom.js";
-import { bytes } from "/static/format.js";
+import { get, toast, url } from "./api.js";
+import { h, setText } from "./dom.js";
+import { bytes } from "./format.js";
 
 const ASK_MS = 1000;
 const FORMATS = [
@@ -11,9 +11,17 @@ const FORMATS = [
   { name: "csv", title: "CSV", text: "A row for every fit, for spreadsheets and R" },
 ];
 
+/** @import { Summary } from "./api.js" */
+
+/** @type {Set<string>} */
 const working = new Set();
 
-/** Fill the menu; sizes are estimates until a file is made. */
+/**
+ * Fill the menu; sizes are estimates until a file is made.
+ * @param {HTMLElement} place
+ * @param {string} job
+ * @param {Summary} summary
+ */
 export function showDownloads(place, job, summary) {
   if (working.size) return; // a button that tells how far it is stays
   place.replaceChildren(...FORMATS.map((format) => {
@@ -25,6 +33,12 @@ export function showDownloads(place, job, summary) {
   }));
 }
 
+/**
+ * @param {string} job
+ * @param {{ name: string }} format
+ * @param {HTMLButtonElement} button
+ * @param {HTMLElement} size
+ */
 async function download(job, format, button, size) {
   const place = `/jobs/${job}/results/download`, said = size.textContent;
   working.add(format.name);

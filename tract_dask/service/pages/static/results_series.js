@@ -1,9 +1,15 @@
 // The chosen columns in time: three charts with one axis of time, and the same as CSV.
 
-import { get, toast } from "/static/api.js";
-import { lineChart } from "/static/charts.js";
-import { h, setText } from "/static/dom.js";
-import { several, significant } from "/static/format.js";
+import { get, toast } from "./api.js";
+import { lineChart } from "./charts.js";
+import { at, h, setText } from "./dom.js";
+import { several, significant } from "./format.js";
+
+/**
+ * @import { Summary } from "./api.js"
+ * @import { Range } from "./chart_scale.js"
+ * @typedef {{ column_id: number, frames_per_point: number, frame: number[], accepted: number[], t: number[], [name: string]: any }} Found
+ */
 
 export const MOST = 6; // columns at a time: as many as there are colours
 const POINTS = 1500;
@@ -17,28 +23,44 @@ const HEADER = ["column_id", "frame", "frames", "accepted", "time", "x_px", "x_s
  *   panel.colours                            // Map of id to CSS colour
  */
 export class SeriesPanel {
+  /** @param {{ job: string, onRemove: (id: number) => void }} options */
   constructor({ job, onRemove }) {
-    Object.assign(this, { job, onRemove, ids: [], slots: new Map(), found: new Map(), view: null, absolute: false });
-    const chart = (id, label, height) => lineChart(document.getElementById(id), {
+    this.job = job;
+    this.onRemove = onRemove;
+    /** @type {number[]} */
+    this.ids = [];
+    /** @type {Map<number, number>} */
+    this.slots = new Map(); // of colours, by column
+    /** @type {Map<number, Found>} */
+    this.found = new Map(); // by column
+    /** @type {Range | null} */
+    this.view = null;
+    this.absolute = false;
+    this.rate = this.waiting = 0;
+    this.unit = this.timeUnit = "";
+    const chart = (/** @type {string} */ id, /** @type {string} */ label, /** @type {number} */ height) => lineChart(at(id), {
       label, height, group: "series", empty: "Click a column on the map, or in the table", onRange: (range) => this.zoomed(range),
     });
     this.charts = { x: chart("series-x", "x in time", 146), y: chart("series-y", "y in time", 146), intensity: chart("series-intensity", "Intensity in time", 160) };
     this.lengths = ["Displacement", "Place"].map((text, index) => h("button", { type: "button", "aria-pressed": String(index === 0), onclick: () => this.setAbsolute(index === 1) }, text));
-    document.getElementById("lengths").append(...this.lengths);
-    document.getElementById("copy").addEventListener("click", () => this.copy());
-    document.getElementById("save").addEventListener("click", () => this.save());
+    at("lengths").append(...this.lengths);
+    at("copy").addEventListener("click", () => this.copy());
+    at("save").addEventListener("click", () => this.save());
   }
 
   get colours() { return new Map([...this.slots].map(([id, slot]) => [id, `var(--series-${slot})`])); }
 
-  /** Show these columns; one that stays keeps its colour. */
+  /**
+   * Show these columns; one that stays keeps its colour.
+   * @param {number[]} ids
+   */
   async choose(ids) {
     this.ids = ids.slice(-MOST);
     for (const id of [...this.slots.keys()]) if (!this.ids.includes(id)) { this.slots.delete(id); this.found.delete(id); }
     for (const id of this.ids) {
       if (this.slots.has(id)) continue;
       const taken = new Set(this.slots.values());
-      this.slots.set(id, [1, 2, 3, 4, 5, 6].find((slot) => !taken.has(slot)));
+      this.slots.set(id, [1, 2, 3, 4, 5, 6].find((slot) => !taken.has(slot)) ?? 1);
     }
     this.list();
     await this.load(this.ids.filter((id) => !this.found.has(id)));
@@ -46,9 +68,11 @@ export class SeriesPanel {
 
   reload() { return this.load(this.ids); }
 
+  /** @param {number[]} ids */
   async load(ids) {
     const wanted = this.span();
     try {
+      /** @type {Found[]} */
       const came = await Promise.all(ids.map((id) => get(`/jobs/${this.job}/results/series/${id}`, { points: POINTS, ...wanted })));
       for (const one of came) if (this.ids.includes(one.column_id)) this.found.set(one.column_id, one);
     } catch (error) { toast(error); }
@@ -62,6 +86,7 @@ export class SeriesPanel {
     return { start, stop: Math.max(start + 2, Math.ceil(this.view[1] / this.rate) + 2) };
   }
 
+  /** @param {Range | null} range */
   zoomed(range) {
     this.view = range;
     clearTimeout(this.waiting);
@@ -69,49 +94,55 @@ export class SeriesPanel {
     if (binned || !range) this.waiting = setTimeout(() => this.reload(), 120);
   }
 
+  /** @param {boolean} absolute */
   setAbsolute(absolute) {
     this.absolute = absolute;
     this.lengths.forEach((button, index) => button.setAttribute("aria-pressed", String((index === 1) === absolute)));
     this.draw();
   }
 
-  /** What the movie is: { frames, frame_time_s, unit, time_unit }. */
+  /**
+   * What the movie is.
+   * @param {Summary} summary
+   */
   about({ frames, frame_time_s: time, unit, time_unit: timeUnit }) {
-    Object.assign(this, { rate: time ?? 1, unit, timeUnit });
+    [this.rate, this.unit, this.timeUnit] = [time ?? 1, unit, timeUnit];
+    /** @type {Range} */
     const xRange = [0, Math.max(frames.total - 1, 1) * this.rate];
     for (const chart of Object.values(this.charts)) chart.update({ xRange, formatX: (value) => `${significant(value, 6)} ${timeUnit}` });
   }
 
   draw() {
-    const all = this.ids.map((id) => this.found.get(id)).filter(Boolean);
-    const lines = (name) => all.map((one) => ({
+    const all = this.ids.flatMap((id) => this.found.get(id) ?? []);
+    const lines = (/** @type {string} */ name) => all.map((one) => ({
       name: String(one.column_id), unit: this.unitOf(name), x: one.t, y: one[name], color: this.slots.get(one.column_id),
-      low: one[name].map((value, index) => beside(value, one[`${name}_stderr`][index], -1)),
-      high: one[name].map((value, index) => beside(value, one[`${name}_stderr`][index], 1)),
+      low: one[name].map((/** @type {number | null} */ value, /** @type {number} */ index) => beside(value, one[`${name}_stderr`][index], -1)),
+      high: one[name].map((/** @type {number | null} */ value, /** @type {number} */ index) => beside(value, one[`${name}_stderr`][index], 1)),
     }));
     for (const axis of ["x", "y"]) {
       const name = this.absolute ? axis : `d${axis}`;
       this.charts[axis].update({ series: lines(name), yLabel: `${axis}${this.absolute ? "" : " from its place in the sum"} (${this.unitOf(name)})` });
     }
-    this.charts.intensity.update({ series: lines("intensity"), yLabel: "intensity (counts)", xLabel: `time (${this.timeUnit ?? "s"})` });
+    this.charts.intensity.update({ series: lines("intensity"), yLabel: "intensity (counts)", xLabel: `time (${this.timeUnit || "s"})` });
     const step = Math.max(...all.map((one) => one.frames_per_point), 1);
-    setText(document.getElementById("series-said"), all.length ? `${step > 1 ? `Means of ${several(step, "frame")}` : "Accepted fits of single frames"} with their standard errors (bands). Drag to zoom, double-click for all.` : "");
-    for (const id of ["copy", "save"]) document.getElementById(id).disabled = !all.length;
+    setText(at("series-said"), all.length ? `${step > 1 ? `Means of ${several(step, "frame")}` : "Accepted fits of single frames"} with their standard errors (bands). Drag to zoom, double-click for all.` : "");
+    for (const id of ["copy", "save"]) at(id, HTMLButtonElement).disabled = !all.length;
   }
 
-  unitOf(name) { return name === "intensity" ? "counts" : name.startsWith("d") ? this.unit ?? "px" : "px"; }
+  /** @param {string} name */
+  unitOf(name) { return name === "intensity" ? "counts" : name.startsWith("d") ? this.unit || "px" : "px"; }
 
   list() {
-    document.getElementById("chosen").replaceChildren(...this.ids.map((id) => {
+    at("chosen").replaceChildren(...this.ids.map((id) => {
       const close = h("button", { type: "button", class: "icon", "aria-label": `Do not show column ${id}`, onclick: () => this.onRemove(id) }, "×");
       const item = h("li", {}, `${id}`, close);
-      item.style.setProperty("--own", this.colours.get(id));
+      item.style.setProperty("--own", this.colours.get(id) ?? null);
       return item;
     }));
   }
 
   csv() {
-    const rows = this.ids.map((id) => this.found.get(id)).filter(Boolean).flatMap((one) => one.t.map((time, index) => [
+    const rows = this.ids.flatMap((id) => this.found.get(id) ?? []).flatMap((one) => one.t.map((time, index) => [
       one.column_id, one.frame[index], one.frames_per_point, one.accepted[index], time,
       one.x[index], one.x_stderr[index], one.y[index], one.y_stderr[index], one.intensity[index], one.intensity_stderr[index],
     ].map((value) => value ?? "").join(",")));
@@ -133,4 +164,5 @@ export class SeriesPanel {
   }
 }
 
+/** @type {(value: number | null, error: number | null, side: number) => number | null} */
 const beside = (value, error, side) => (value === null ? null : error === null ? value : value + side * error);

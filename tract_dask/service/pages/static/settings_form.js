@@ -2,6 +2,22 @@
 
 import { h, setAttribute, setText } from "./dom.js";
 
+/**
+ * @typedef {object} Declared a setting as GET /settings tells it
+ * @property {string} group
+ * @property {string} title of the group
+ * @property {string} name
+ * @property {string} type "boolean", "integer", "number", "string" or "array"
+ * @property {string | null} items of an array
+ * @property {boolean} optional
+ * @property {string[]} choices
+ * @property {string} unit
+ * @property {number | null} low
+ * @property {number | null} high
+ * @property {any} default
+ * @property {string} description
+ */
+
 /** Settings that matter only beside others: shown where these hold, or where they are changed. */
 const ONLY_WITH = {
   "drift.csv": (value) => value("drift.method") === "csv",
@@ -43,11 +59,17 @@ export const unitText = (unit) => UNITS[unit] ?? unit;
 
 /** One setting: its control, its sentence, what is wrong with it, and a way back to the default. */
 class Setting {
+  /**
+   * @param {Declared} row
+   * @param {(setting: Setting) => void} onChange
+   */
   constructor(row, onChange) {
     this.row = row;
     this.key = `${row.group}.${row.name}`;
     this.onChange = onChange;
     this.id = `setting-${row.group}-${row.name}`;
+    this.changed = false;
+    /** @type {HTMLInputElement | HTMLSelectElement | HTMLTextAreaElement} */
     this.control = this.makeControl();
     this.problem = h("div", { class: "problem", id: `${this.id}-problem`, hidden: true });
     this.undo = h("button", { type: "button", class: "link undo", hidden: true, onclick: () => { this.reset(); onChange(this); }, "aria-label": `Reset ${this.title}` }, "Reset");
@@ -85,14 +107,17 @@ class Setting {
     return String(row.default);
   }
 
-  /** Say what stands where the user leaves it empty. */
-  setPlaceholder(text) { this.control.placeholder = text; }
+  /**
+   * Say what stands where the user leaves it empty.
+   * @param {string} text
+   */
+  setPlaceholder(text) { if ("placeholder" in this.control) this.control.placeholder = text; }
 
   reset() { this.set(this.row.default); }
 
   set(value) {
     const { control, row } = this;
-    if (row.type === "boolean") control.checked = value;
+    if ("checked" in control && row.type === "boolean") control.checked = value;
     else if (row.choices.length) control.value = value;
     else if (row.items === "object") control.value = value?.length ? JSON.stringify(value) : "";
     else if (Array.isArray(value)) control.value = value.join(", ");
@@ -103,10 +128,10 @@ class Setting {
   /** The value; undefined where it is the default. Throws an Error with what is wrong. */
   read() {
     const { control, row } = this;
-    let value = control.value;
-    if (row.type === "boolean") value = control.checked;
+    let value = /** @type {any} */ (control.value);
+    if ("checked" in control && row.type === "boolean") value = control.checked;
     else if (!row.choices.length) {
-      const text = value.trim();
+      const text = control.value.trim();
       if (!text) return undefined;
       value = row.items === "object" ? tables(text) : row.type === "array" ? text.split(",").map((part) => number(part, true)) : row.type === "string" ? text : number(text, row.type === "integer");
       if (row.low !== null && value < row.low) throw new Error(`At least ${row.low} ${unitText(row.unit)}`);
@@ -137,6 +162,10 @@ class Setting {
   }
 }
 
+/**
+ * @param {string} text
+ * @param {boolean} whole whether it must be
+ */
 function number(text, whole) {
   const value = Number(text.trim().replace(/^(-?\d+),(\d+)$/, "$1.$2"));
   if (!Number.isFinite(value) || text.trim() === "") throw new Error(`“${text.trim()}” is not a number`);
@@ -154,24 +183,26 @@ function tables(text) {
 
 export class SettingsForm {
   /**
-   * @param {object[]} rows as GET /settings tells them
+   * @param {Declared[]} rows as GET /settings tells them
    * @param {{ metadata: HTMLElement, important: HTMLElement, groups: HTMLElement }} places
    * @param {string[]} important keys of those that are seen first, such as "fit.estimator"
    * @param {() => void} onChange after every change
    */
   constructor(rows, places, important, onChange) {
+    /** @type {Map<string, Setting>} */
     this.settings = new Map();
     this.onChange = onChange;
     for (const row of rows) {
       const setting = new Setting(row, () => { this.arrange(); onChange(); });
       this.settings.set(setting.key, setting);
     }
-    places.metadata.append(...rows.filter((row) => row.group === "metadata").map((row) => this.settings.get(`metadata.${row.name}`).element));
-    places.important.append(...important.map((key) => this.settings.get(key).element));
+    const of = (/** @type {Declared} */ row) => this.settings.get(`${row.group}.${row.name}`) ?? [];
+    places.metadata.append(...rows.filter((row) => row.group === "metadata").flatMap(of).map((one) => one.element));
+    places.important.append(...important.flatMap((key) => this.settings.get(key) ?? []).map((one) => one.element));
     this.groups = [...new Set(rows.map((row) => row.group))].filter((group) => group !== "metadata").map((group) => {
-      const own = rows.filter((row) => row.group === group && !important.includes(`${group}.${row.name}`)).map((row) => this.settings.get(`${group}.${row.name}`));
+      const own = rows.filter((row) => row.group === group && !important.includes(`${group}.${row.name}`)).flatMap(of);
       const number = h("span", { class: "count" });
-      const title = rows.find((row) => row.group === group).title;
+      const title = rows.find((row) => row.group === group)?.title ?? group;
       const details = h("details", { class: "group", id: `group-${group}` }, h("summary", {}, `More: ${title.toLowerCase()} `, h("span", { class: "muted small" }, `${own.length}`), number), h("div", { class: "grid-3" }, ...own.map((one) => one.element)));
       return { group, own, number, details };
     });

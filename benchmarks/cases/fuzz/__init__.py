@@ -1,0 +1,1 @@
+"""Mutated files through the readers, with limits on time and memory."""

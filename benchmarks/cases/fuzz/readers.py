@@ -1,0 +1,106 @@
+"""Mutated files of every format, by the thousand, each within limits.
+
+``python -m benchmarks.cases.fuzz.readers 0 10000`` reads 10,000 of them. The bases and mutations are those of
+tests/readers/test_reader_fuzz.py, which runs a few of each. Right: every file gives frames or an error of ours, within
+10 s and 3 GiB; a process that dies costs its one file, and is told.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import runpy
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..common import Clock, work_folder
+
+TESTS = Path(__file__).parents[3] / "tests" / "readers" / "test_reader_fuzz.py"
+MEMORY_BYTES = 3 << 30
+LIMIT_S = 10
+SLOW_S = 3.0
+BATCH = 1000
+
+
+class _Late(BaseException):
+    """The file took too long."""
+
+
+def _late(*_: object) -> None:
+    raise _Late
+
+
+def read(first: int, last: int, folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the seed before, and the outcome after, each mutated file was read."""
+    fuzz = runpy.run_path(str(TESTS))
+    bases = sorted(fuzz["BASES"])
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    signal.signal(signal.SIGALRM, _late)
+    for seed in range(first, last):
+        name = bases[seed % len(bases)]
+        yield {"seed": seed, "name": name}
+        path = folder / name
+        path.unlink(missing_ok=True)
+        fuzz["BASES"][name](path)
+        path.write_bytes(fuzz["mutated"](path.read_bytes(), seed))
+        signal.alarm(LIMIT_S)
+        with Clock() as clock:
+            end = _outcome(fuzz, path)
+        signal.alarm(0)
+        yield {"seed": seed, "name": name, "end": "slow" if end == "ok" and clock.wall_s > SLOW_S else end}
+
+
+def _outcome(fuzz: dict[str, Any], path: Path) -> str:
+    try:
+        return str(fuzz["outcome"](path))
+    except _Late:
+        return "HANG"
+    except Exception as error:  # noqa: BLE001 - any is what is looked for
+        return f"RAW {type(error).__name__}: {error}"[:120]
+
+
+def batch(first: int, last: int) -> Iterator[dict[str, Any]]:
+    """Yield the outcomes of files that another process reads; where it dies, that is the last file's outcome."""
+    command = [sys.executable, "-m", __spec__.name if __spec__ else __name__, str(first), str(last), "--here"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    begun: dict[str, Any] | None = None
+    for line in process.stdout or ():
+        record = json.loads(line)
+        begun = None if "end" in record else record
+        if begun is None:
+            yield record
+    if process.wait() and begun:
+        yield begun | {"end": f"DIED with {process.returncode}"}
+
+
+def main() -> None:
+    """Print what is neither frames nor an error of ours, and how often each end came."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("first", type=int, nargs="?", default=0)
+    parser.add_argument("last", type=int, nargs="?", default=1000)
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.here:
+        with work_folder() as folder:
+            for record in read(options.first, options.last, folder):
+                print(json.dumps(record), flush=True)
+        return
+    ends: Counter[str] = Counter()
+    at = options.first
+    while at < options.last:
+        for record in batch(at, min(at + BATCH, options.last)):
+            ends[record["end"].split(":")[0]] += 1
+            at = record["seed"] + 1
+            if record["end"] not in ("ok", "refused"):
+                print(record, flush=True)
+    print(dict(ends))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Damage to the stores, and costs that grow with the number of frames, columns or tasks."""

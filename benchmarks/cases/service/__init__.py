@@ -1,0 +1,1 @@
+"""Requests that a service must refuse, and what one request may cost the others."""
