@@ -301,7 +301,7 @@ def arrays_of(store: Path) -> dict[str, bytes]:
 
 def test_damaged_columns_ask_for_the_table_too(run, copy):
     (copy / "columns.zarr" / "x_ref" / "c.0").write_bytes(b"")
-    with pytest.raises(StoreError, match=r"columns\.csv.*--columns") as told:
+    with pytest.raises(StoreError, match=r"columns\.csv.*--columns-csv") as told:
         again(copy, run.parent / "movie.npy")
     assert "columns.zarr" in told.value.where
     shutil.rmtree(copy / "columns.zarr")

@@ -16,7 +16,7 @@ import click
 from ..errors import InputError
 from ..progress import Event, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 from ..settings.run import RunSettings
-from .options import setting_options
+from .options import Command, setting_options
 from .show import PATH, common_options, show
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def service_options(function: F) -> F:
     return cast("F", decorated)
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("source")
 @click.option("--output", default="", metavar="FOLDER", help="Folder under the data root; otherwise one of its own.")
 @click.option("--label", default="", metavar="TEXT", help="To find it again.")

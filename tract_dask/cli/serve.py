@@ -10,7 +10,7 @@ import click
 
 from ..cluster.forkserver import uncollected
 from ..settings.run import RunSettings
-from .options import setting_options
+from .options import Command, setting_options
 from .show import PATH, Subgroup, common_options, debug_option, show
 
 data_root_option = click.option(
@@ -31,7 +31,7 @@ state_dir_option = click.option(
 )
 
 
-@click.command()
+@click.command(cls=Command)
 @data_root_option
 @state_dir_option
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on; any other demands tokens.")

@@ -68,7 +68,7 @@ def check_columns(shape: tuple[int, ...], settings: ColumnSettings, window_px: i
         As :func:`check_inputs`.
     """
     if settings.method == "csv":
-        table = _required(settings.csv, "--columns")
+        table = _required(settings.csv, "--columns-csv")
         check_inside(read_columns_csv(table), shape, str(table))
     if settings.method == "lattice":
         lattice_sites(settings.lattices, shape)

@@ -65,13 +65,14 @@ class ClusterSettings(Settings):
         choices=("local", "address", "slurm", "ssh"),
         in_files_only=True,
     )
-    scheduler: str | None = setting(None, "Address of a running Dask scheduler")
+    scheduler: str | None = setting(None, "Address of a running Dask scheduler", common=True)
     scheduler_file: str | None = setting(None, "Scheduler file of a running Dask scheduler")
     workers: int | None = setting(
         None,
         "Worker processes: of the local cluster or of each ssh host (unset: one a core), or of all SLURM jobs",
         low=1,
         high=4096,
+        common=True,
     )
     min_workers: int | None = setting(
         None,
@@ -81,7 +82,7 @@ class ClusterSettings(Settings):
         in_files_only=True,
     )
     memory_limit: str | None = setting(
-        None, "Memory of each worker that we start, such as 2GB; unset: its share of the machine"
+        None, "Memory of each worker that we start, such as 2GB; unset: its share of the machine", common=True
     )
     threads: int = setting(
         1, "Threads of each worker that we start: tasks that share its memory", low=1, high=256, in_files_only=True

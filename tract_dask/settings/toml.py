@@ -12,7 +12,7 @@ import tomli_w
 
 from ..errors import SettingsError, shown
 from .cluster import ClusterSettings
-from .declare import Settings, T
+from .declare import Settings, T, is_optional, plain_type
 from .run import RunSettings
 
 
@@ -74,6 +74,53 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "settings") ->
             )
         arguments[name] = from_dict(kinds[name], value, f"{where} [{name}]") if nested else value
     return kind(**arguments)
+
+
+def assigned(text: str) -> tuple[tuple[str, ...], Any]:
+    """Return the path and the value of a run's setting that is written as ``group.name=value``; None where it is unset.
+
+    Text needs no quotes, and a list no brackets.
+
+    Raises
+    ------
+    SettingsError
+        Where there is no such setting, or no value.
+
+    Examples
+    --------
+    >>> assigned("fit.vacuum_box=0,64,0,64")
+    (('fit', 'vacuum_box'), [0, 64, 0, 64])
+    """
+    name, equals, value = text.partition("=")
+    path = tuple(name.strip().split("."))
+    kind: Any = RunSettings
+    for part in path:
+        kinds = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
+        if part not in kinds:
+            expected = f"one of {', '.join(kinds)}" if kinds else f"{name.rpartition('.')[0]} without a further name"
+            remedy = "Correct its name; docs/settings.md lists them all"
+            raise SettingsError(f"there is no setting {part!r}", f"--set {text}", expected, name, remedy)
+        kind = kinds[part]
+    if not equals or dataclasses.is_dataclass(kind):
+        remedy = "Write it as group.name=value, such as fit.window_px=31"
+        raise SettingsError("a setting and its value are needed", f"--set {text}", "group.name=value", text, remedy)
+    return path, _value(value.strip(), kind)
+
+
+def _value(text: str, annotation: Any) -> Any:
+    kind = plain_type(annotation)
+    if text == "unset" and (is_optional(annotation) or kind is tuple):
+        return None
+    if kind is str:
+        return text
+    if kind is tuple and not text.startswith("["):
+        if str in typing.get_args(annotation):
+            return text.split(",")
+        text = f"[{text}]"
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except ValueError:
+        return text
 
 
 def load(path: Path) -> RunSettings:

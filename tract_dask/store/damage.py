@@ -112,8 +112,8 @@ def remedy(file: Path) -> str:
     if (store / "status_ref").exists() and not (store / "fit").exists():
         table = store.with_suffix(".csv")
         return (
-            f"Remove {store}, move {table.name} beside it elsewhere, and {again}; give the table with --columns if you "
-            "have edited it"
+            f"Remove {store}, move {table.name} from there, and {again}; if you have edited the table, give it with "
+            "--columns-csv"
         )
     return f"Remove {store} and {again}: nothing else is made anew"
 

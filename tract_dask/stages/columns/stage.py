@@ -169,7 +169,7 @@ class _Table:
                 str(self.csv),
                 "nothing, or a table of an earlier run",
                 "another file",
-                "Choose another place, say --overwrite, or give the table as --columns",
+                "Choose another place, say --overwrite, or give the table with --columns-csv",
             )
 
     @property
