@@ -138,7 +138,7 @@ def test_all_pages_are_read(client, jobs, monkeypatch):
         (lambda client: client.submit("gone.npy"), MissingStoreError, "gone.npy: there is no such file"),
         (lambda client: client.submit("notes.txt"), SourceError, "notes.txt: the format is unknown"),
         (lambda client: client.submit("movie.npy", {"fit": {"window_px": 8}}), SettingsError, "odd number from 5 to"),
-        (lambda client: client.submit("movie.npy", output="sub"), DestinationError, "holds something else"),
+        (lambda client: client.submit("movie.npy", output="sub"), DestinationError, "already holds other files"),
         (lambda client: client.submit("../x"), InputError, "data root"),
         (lambda client: client.job("0123456789"), InputError, "0123456789: there is no such job"),
         (lambda client: client.job("nothing"), InputError, "pattern"),
@@ -336,7 +336,7 @@ def test_the_commands(service, client, jobs, monkeypatch):
         assert found.exit_code == code, found.output
         return found
 
-    assert "There are no such jobs" in command("jobs").stdout
+    assert "No jobs found" in command("jobs").stdout
     wrong = command("submit", "movie.npy", "--window-px", "8", code=2)
     assert "odd number" in wrong.stderr
     submitted = command("submit", "movie.npy", "--window-px", "9", "--label", "mine", "--curate", "--json")

@@ -218,7 +218,7 @@ def test_a_folder_can_be_deleted_by_who_holds_it(tmp_path):
 
 def test_a_disk_error_says_so(lock, monkeypatch):
     without_locks(monkeypatch, errno.EIO)
-    with pytest.raises(DestinationError, match=r"cannot be held against other processes.*error"):
+    with pytest.raises(DestinationError, match=r"cannot be locked.*error"):
         take(lock)
 
 

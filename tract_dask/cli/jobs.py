@@ -50,14 +50,16 @@ def service_options(function: F) -> F:
 
     decorated: Any = command
     for option in (
-        click.option("--ca", type=PATH, envvar="TRACT_DASK_CA", help="Certificate of the service's authority, ca.pem."),
-        click.option("--token-file", type=PATH, help=f"File with the token; otherwise {TOKEN_VARIABLE} has it."),
+        click.option(
+            "--ca", type=PATH, envvar="TRACT_DASK_CA", help="Certificate of the service's authority (ca.pem)."
+        ),
+        click.option("--token-file", type=PATH, help=f"File with the token; otherwise {TOKEN_VARIABLE} is used."),
         click.option(
             "--server",
             default="http://127.0.0.1:8000",
             envvar="TRACT_DASK_SERVER",
             metavar="URL",
-            help="The service, or TRACT_DASK_SERVER. [http://127.0.0.1:8000].",
+            help="Address of the service; also TRACT_DASK_SERVER. [http://127.0.0.1:8000].",
         ),
     ):
         decorated = option(decorated)
@@ -66,8 +68,8 @@ def service_options(function: F) -> F:
 
 @click.command(cls=Command)
 @click.argument("source")
-@click.option("--output", default="", metavar="FOLDER", help="Folder under the data root; otherwise one of its own.")
-@click.option("--label", default="", metavar="TEXT", help="To find it again.")
+@click.option("--output", default="", metavar="FOLDER", help="Folder under the data root; otherwise a new one.")
+@click.option("--label", default="", metavar="TEXT", help="Text by which to find the job.")
 @click.option("--curate", is_flag=True, help="Stop after the summed image, for columns to be edited by hand.")
 @click.option("--watch", "watching", is_flag=True, help="Show its progress until it ends.")
 @service_options
@@ -89,10 +91,14 @@ def submit(
 
 
 @click.command()
-@click.option("--state", "states", multiple=True, type=click.Choice(STATES), help="Only those; may be repeated.")
-@click.option("--owner", default="", metavar="NAME", help="Only this owner's.")
-@click.option("--text", default="", metavar="TEXT", help="Only those with this in label, source, owner or id.")
-@click.option("--limit", default=20, show_default=True, type=click.IntRange(1), help="Most jobs, the newest first.")
+@click.option(
+    "--state", "states", multiple=True, type=click.Choice(STATES), help="Only jobs in this state; repeatable."
+)
+@click.option("--owner", default="", metavar="NAME", help="Only jobs of this owner.")
+@click.option("--text", default="", metavar="TEXT", help="Only jobs with this text in label, source, owner or id.")
+@click.option(
+    "--limit", default=20, show_default=True, type=click.IntRange(1), help="Number of jobs, the newest first."
+)
 @service_options
 @common_options
 def jobs(service: ServiceClient, *, as_json: bool, **filters: Any) -> None:
@@ -121,7 +127,7 @@ def watch(job: str, service: ServiceClient, *, as_json: bool) -> None:
 @service_options
 @common_options
 def cancel(job: str, service: ServiceClient, *, as_json: bool) -> None:
-    """Cancel JOB; what it has done is kept, and can be gone on from."""
+    """Cancel JOB; what is done is kept, and can be continued."""
     _show_job(service.cancel(service.find(job).id), service, as_json=as_json)
 
 
@@ -234,7 +240,7 @@ def _print_table(found: list[ServiceJob]) -> None:
             job.label,
             job.source,
         )
-    console.print(table if found else "There are no such jobs.")
+    console.print(table if found else "No jobs found.")
 
 
 def _farewell(job: ServiceJob) -> str:

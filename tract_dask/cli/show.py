@@ -40,7 +40,7 @@ debug_option = click.option(
     is_flag=True,
     expose_value=False,
     callback=lambda ctx, param, value: ctx.meta.update({DEBUG: value}),
-    help="Show where in the program an error came up.",
+    help="Show where in the program an error occurred.",
 )
 
 
@@ -64,7 +64,7 @@ def show(found: dict[str, Any], *, as_json: bool) -> None:
 FAILED, BAD_FRAMES = 1, 3
 """Exit codes beside 0, 2 for usage or bad input, and that of an interrupt."""
 
-overwrite_option = click.option("--overwrite", is_flag=True, help="Begin anew, whatever is there.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what is there.")
 
 
 @contextmanager

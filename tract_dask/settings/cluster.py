@@ -61,7 +61,7 @@ class ClusterSettings(Settings):
 
     kind: str | None = setting(
         None,
-        "What starts the workers: this machine, somebody else, SLURM or ssh; unset: local, or address if one is given",
+        "Where workers run: this machine, a running cluster, SLURM or ssh; unset: local, or address if one is given",
         choices=("local", "address", "slurm", "ssh"),
         in_files_only=True,
     )
@@ -132,7 +132,7 @@ class ClusterSettings(Settings):
         }
         what, found = needed.get(self.resolved_kind, ("", True))
         if not found:
-            raise contradiction("kind", what, f"kind = {self.kind!r} without", "Say them")
+            raise contradiction("kind", what, f"kind = {self.kind!r} without", "Set them")
         if named and self.resolved_kind != "address":
             raise contradiction(
                 named[0], "kind = 'address', or none", f"kind = {self.kind!r}", "Leave the scheduler or the kind out"

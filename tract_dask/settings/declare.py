@@ -161,14 +161,14 @@ def _check_items(where: str, meta: Mapping[str, Any], annotation: Any, value: tu
     listed = next((arg for arg in typing.get_args(annotation) if typing.get_origin(arg) is tuple), annotation)
     if int in typing.get_args(listed) and not all(type(item) is int and abs(item) < 2**63 for item in value):
         raise SettingsError(
-            "the list holds something else", where, "whole numbers", shown(list(value)), meta["description"]
+            "the list holds other values", where, "whole numbers", shown(list(value)), meta["description"]
         )
 
 
 def _check_text(where: str, meta: Mapping[str, Any], texts: Iterable[Any]) -> None:
     for text in texts:
         if not isinstance(text, str) or not re.fullmatch(meta["pattern"], text):
-            raise SettingsError("the text has another form", where, meta["form"], shown(text), meta["description"])
+            raise SettingsError("the text has the wrong form", where, meta["form"], shown(text), meta["description"])
 
 
 def contradiction(name: str, expected: str, got: str, remedy: str) -> SettingsError:

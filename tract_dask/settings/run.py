@@ -16,7 +16,7 @@ from .declare import Settings, setting
 
 @dataclass(frozen=True)
 class SourceSettings(Settings):
-    """How to read a file that does not say enough about itself."""
+    """How to read a raw file, which does not describe itself."""
 
     raw_shape: tuple[int, ...] | None = setting(
         None,
@@ -29,7 +29,7 @@ class SourceSettings(Settings):
 
 @dataclass(frozen=True)
 class MetadataSettings(Settings):
-    """What the user knows better than the file; unset means as the file says."""
+    """Values that replace those of the file; unset: the file's."""
 
     pixel_size_pm: float | None = setting(None, "Size of a pixel", unit="pm", low=1e-3, high=1e7, common=True)
     frame_time_s: float | None = setting(
@@ -81,7 +81,7 @@ class ColumnSettings(Settings):
 
     method: str = setting(
         "auto",
-        "Find columns automatically, on lattices, at the positions of a CSV file, or by what stands out of the noise",
+        "auto: on the image's lattice; lattice: on lattices; csv: a table; maxima, blobs, template: peak detectors",
         choices=("auto", "lattice", "csv", "maxima", "blobs", "template"),
         grouped=True,
         common=True,
@@ -110,11 +110,11 @@ class ColumnSettings(Settings):
         0.15, "Weakest column that is kept, against the median amplitude", low=0, high=1, common=True
     )
     detection_threshold: float = setting(
-        5.0, "Methods maxima, blobs, template: weakest column, in units of what noise alone shows", low=0, high=1e4
+        5.0, "Methods maxima, blobs, template: weakest column, in units of the peaks of noise alone", low=0, high=1e4
     )
     template: tuple[int, ...] | None = setting(
         None,
-        "Method template: x, y of the column that the others look like; unset: the mean of the strongest",
+        "Method template: x, y of an example column; unset: the mean of the strongest",
         unit="px",
     )
 
@@ -145,13 +145,13 @@ class FitSettings(Settings):
     )
     filter: str = setting(
         "gaussian",
-        "What frames go through before lsq fits: a Gaussian blur, a filter of the whole frame, or nothing",
+        "Filter before lsq fits: a Gaussian blur, a filter of the whole frame (wiener, tv-l1), or none",
         choices=("gaussian", "wiener", "tv-l1", "none"),
         common=True,
     )
     blur_sigma_px: float = setting(
         2.0,
-        "Gaussian blur (the paper's 2 px) before columns, noise and lsq fits are looked at; 0 leaves pixels raw",
+        "Sigma of the Gaussian blur before columns, noise and lsq fits (the paper's 2 px); 0: no blur",
         unit="px",
         low=0,
         high=20,
@@ -159,7 +159,7 @@ class FitSettings(Settings):
     )
     wiener_background: float = setting(
         1.0,
-        "Filter wiener: times that the radial background of the power spectrum is subtracted",
+        "Filter wiener: factor of the radial background that is subtracted from the power spectrum",
         low=0,
         high=100,
     )
@@ -203,7 +203,7 @@ class FitSettings(Settings):
         common=True,
     )
     counting: bool = setting(
-        True, "For standard errors: the noise grows with the signal, as counts do; else it is the same in every pixel"
+        True, "For standard errors: noise that grows with the signal, as in counts; off: the same noise in every pixel"
     )
     intensity_scale: str = setting(
         "paper",

@@ -48,7 +48,7 @@ def from_toml(kind: type[T], text: str, where: str = "settings") -> T:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(
-            "this is not valid TOML", where, got=str(error), remedy="Mend the line that it names"
+            "this is not valid TOML", where, got=str(error), remedy="Correct the line that it names"
         ) from error
     return from_dict(kind, values, where)
 
