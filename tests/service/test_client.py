@@ -216,7 +216,7 @@ def test_a_service_that_is_not_there_is_said_to_be(tmp_path):
             client.jobs()
         with pytest.raises(ServiceError, match="cannot be reached"):
             client.wait("0123456789")
-    for wrong, words in (("localhost:8000", "no address"), ("ftp://x", "no address")):
+    for wrong, words in (("localhost:8000", "not an address"), ("ftp://x", "not an address")):
         with pytest.raises(InputError, match=words):
             ServiceClient(wrong)
     with pytest.raises(InputError, match="certificate"):

@@ -200,7 +200,7 @@ def test_a_pipe_is_not_waited_for_and_a_link_not_followed(lock, tmp_path):
     take(lock)
     lock.unlink()
     lock.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DestinationError, match="cannot be held"):
+    with pytest.raises(DestinationError, match="cannot be locked"):
         take(lock)
     assert not (tmp_path / "elsewhere").exists()
 

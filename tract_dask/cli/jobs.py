@@ -50,9 +50,7 @@ def service_options(function: F) -> F:
 
     decorated: Any = command
     for option in (
-        click.option(
-            "--ca", type=PATH, envvar="TRACT_DASK_CA", help="Certificate of the service's authority (ca.pem)."
-        ),
+        click.option("--ca", type=PATH, envvar="TRACT_DASK_CA", help="Certificate of the service's authority, ca.pem."),
         click.option("--token-file", type=PATH, help=f"File with the token; otherwise {TOKEN_VARIABLE} is used."),
         click.option(
             "--server",
@@ -91,14 +89,10 @@ def submit(
 
 
 @click.command()
-@click.option(
-    "--state", "states", multiple=True, type=click.Choice(STATES), help="Only jobs in this state; repeatable."
-)
+@click.option("--state", "states", multiple=True, type=click.Choice(STATES), help="Only in this state; repeatable.")
 @click.option("--owner", default="", metavar="NAME", help="Only jobs of this owner.")
 @click.option("--text", default="", metavar="TEXT", help="Only jobs with this text in label, source, owner or id.")
-@click.option(
-    "--limit", default=20, show_default=True, type=click.IntRange(1), help="Number of jobs, the newest first."
-)
+@click.option("--limit", default=20, show_default=True, type=click.IntRange(1), help="Most jobs, the newest first.")
 @service_options
 @common_options
 def jobs(service: ServiceClient, *, as_json: bool, **filters: Any) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-import tomllib
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -43,17 +42,6 @@ def numbers(text: str) -> tuple[int, ...]:
         ) from error
 
 
-def toml_list(text: str) -> tuple[Any, ...]:
-    """Return a list that is written as in TOML."""
-    try:
-        found = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError as error:
-        raise click.BadParameter(f"{text!r} is not TOML: {error}") from error
-    if not isinstance(found, list):
-        raise click.BadParameter(f"{text!r} is not a list, such as [{{origin = [10, 10]}}]")
-    return tuple(found)
-
-
 class SettingOption(click.Option):
     """An option for a setting: its heading in the help, and whether ``--help`` lists it or only ``--help-all``."""
 
@@ -87,29 +75,16 @@ def _show_all(ctx: click.Context, _: click.Parameter, value: bool) -> None:
 
 _FILE = click.Path(dir_okay=False, path_type=Path)
 
+_CONFIG = "Settings to start from, such as the run.toml of an earlier run; options override them."
+_SET = "Set any setting (docs/settings.md), such as fit.window_px=31 or fit.vacuum_box=unset; repeatable."
+_HELP_ALL = "Show all options, not only the common ones, and exit."
+
 _COLLECTING = (
-    click.option(
-        "--help-all",
-        is_flag=True,
-        is_eager=True,
-        expose_value=False,
-        callback=_show_all,
-        help="Show all options, not only the common ones, and exit.",
-    ),
-    click.option(
-        "--set",
-        "assignments",
-        multiple=True,
-        metavar="GROUP.NAME=VALUE",
-        help="Set any setting (docs/settings.md), such as fit.window_px=31 or fit.vacuum_box=unset; repeatable.",
-    ),
-    click.option(
-        "--config",
-        type=_FILE,
-        help="Settings to start from, such as the run.toml of an earlier run; options override them.",
-    ),
+    click.option("--help-all", is_flag=True, is_eager=True, expose_value=False, callback=_show_all, help=_HELP_ALL),
+    click.option("--set", "assignments", multiple=True, metavar="GROUP.NAME=VALUE", help=_SET),
+    click.option("--config", type=_FILE, help=_CONFIG),
 )
-"""The options beside those of the settings themselves, last to first."""
+"""The options for settings of all groups, last to first."""
 
 
 def setting_options(*groups: str) -> Callable[[F], F]:
@@ -240,13 +215,8 @@ def _assigned(texts: tuple[str, ...], groups: tuple[str, ...]) -> dict[tuple[str
     found = dict(map(toml.assigned, texts))
     for path in found:
         if not {path[0], ".".join(path[:2])} & set(groups):
-            raise SettingsError(
-                "this command does not use the setting",
-                "--set",
-                f"a setting of {', '.join(groups)}",
-                ".".join(path),
-                "Leave it out, or set it with tract-dask run",
-            )
+            what, remedy = "this command does not use the setting", "Leave it out, or set it with tract-dask run"
+            raise SettingsError(what, "--set", f"a setting of {', '.join(groups)}", ".".join(path), remedy)
     return found
 
 
@@ -287,27 +257,16 @@ def _option(
         default = "on" if item.default else "off"
     else:
         default = "" if item.default in (None, ()) else f"{item.default:g}" if plain is float else f"{item.default}"
-        more["type"] = click.Choice(meta["choices"]) if meta["choices"] else _click_type(plain, annotation)
+        more["type"] = click.Choice(meta["choices"]) if meta["choices"] else lambda text: toml.value(text, annotation)
         more["metavar"] = None if meta["choices"] else _metavar(item.name, plain, annotation, meta["unit"])
     text = meta["description"] + (f" [{default}]" if default else "") + "."
     more |= {"help": text, "heading": heading, "common": common}
     return click.option(flag, f"{group}__{item.name}", default=None, cls=SettingOption, **more)
 
 
-def _click_type(plain: Any, annotation: Any) -> Any:
-    if plain is tuple:
-        return toml_list if _free(annotation) else numbers
-    return {int: click.INT, float: click.FLOAT, str: click.STRING}[plain]
-
-
 def _metavar(name: str, plain: Any, annotation: Any, unit: str) -> str:
     if plain is tuple:
-        return "LIST" if _free(annotation) else "N,N,..."
+        return "LIST" if Any in typing.get_args(annotation) else "N,N,..."
     if name.endswith(("csv", "file")):
         return "FILE"
     return unit.upper() if unit else {int: "N", float: "NUMBER", str: "TEXT"}[plain]
-
-
-def _free(annotation: Any) -> bool:
-    """Tell whether a tuple may hold anything, not only whole numbers."""
-    return Any in typing.get_args(annotation)

@@ -34,30 +34,20 @@ state_dir_option = click.option(
 @click.command(cls=Command)
 @data_root_option
 @state_dir_option
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, help="Address to listen on; other addresses require tokens."
-)
-@click.option(
-    "--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
-)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on; others require tokens.")
+@click.option("--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: a free one.")
 @click.option("--concurrency", default=1, show_default=True, type=click.IntRange(1, 64), help="Jobs at the same time.")
 @click.option("--certs", "certificates", type=PATH, help="Folder of tract-dask certs, for https.")
 @click.option("--tokens", is_flag=True, help="Require tokens from users of this machine too.")
-@click.option(
-    "--allowed-host",
-    "allowed_hosts",
-    multiple=True,
-    metavar="NAME",
-    help="Further host name of the service; repeatable.",
-)
+@click.option("--allowed-host", "allowed_hosts", multiple=True, metavar="NAME", help="Further host name; repeatable.")
 @click.option("--trusted-proxy", default="", metavar="ADDRESS", help="Reverse proxy whose X-Forwarded headers count.")
 @debug_option
 @setting_options("cluster")
 def serve(settings: RunSettings, **options: Any) -> None:
     """Serve jobs, their results and pages to watch them.
 
-    Jobs and tokens are kept in the state folder, outside of the data root. After a stop or a
-    crash, start it again: it continues every job.
+    Jobs and tokens are kept in the state folder, outside of the data root. After a stop or a crash, start it again:
+    it continues every job.
     """
     with uncollected():
         from ..service import server
@@ -133,9 +123,7 @@ def token_revoke(name: str, data_root: Path, state_dir: Path | None, *, as_json:
 @click.command()
 @click.argument("folder", type=PATH, metavar="DIR")
 @click.option("--host", "hosts", multiple=True, metavar="NAME", help="Name or address of a machine; may be repeated.")
-@click.option(
-    "--days", default=825, show_default=True, type=click.IntRange(1, 3650), help="Validity of new certificates in days."
-)
+@click.option("--days", default=825, show_default=True, type=click.IntRange(1, 3650), help="Validity of new ones.")
 @common_options
 def certs(folder: Path, hosts: tuple[str, ...], *, days: int, as_json: bool) -> None:
     """Make an authority and certificates for the service and for Dask in the folder DIR.

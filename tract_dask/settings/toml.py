@@ -30,6 +30,7 @@ def to_toml(settings: Settings) -> str:
 
     Examples
     --------
+    >>> from tract_dask.settings import FitSettings
     >>> from_toml(FitSettings, to_toml(FitSettings(window_px=31))).window_px
     31
     """
@@ -91,7 +92,7 @@ def assigned(text: str) -> tuple[tuple[str, ...], Any]:
     >>> assigned("fit.vacuum_box=0,64,0,64")
     (('fit', 'vacuum_box'), [0, 64, 0, 64])
     """
-    name, equals, value = text.partition("=")
+    name, equals, said = text.partition("=")
     path = tuple(name.strip().split("."))
     kind: Any = RunSettings
     for part in path:
@@ -104,20 +105,21 @@ def assigned(text: str) -> tuple[tuple[str, ...], Any]:
     if not equals or dataclasses.is_dataclass(kind):
         remedy = "Write it as group.name=value, such as fit.window_px=31"
         raise SettingsError("a setting and its value are needed", f"--set {text}", "group.name=value", text, remedy)
-    return path, _value(value.strip(), kind)
+    said = said.strip()
+    unset = said == "unset" and (is_optional(kind) or plain_type(kind) is tuple)
+    return path, None if unset else value(said, kind)
 
 
-def _value(text: str, annotation: Any) -> Any:
+def value(text: str, annotation: Any) -> Any:
+    """Return the value of a setting from what a command line says; text that is no such value comes back unchanged."""
     kind = plain_type(annotation)
-    if text == "unset" and (is_optional(annotation) or kind is tuple):
-        return None
-    if kind is str:
-        return text
-    if kind is tuple and not text.startswith("["):
-        if str in typing.get_args(annotation):
-            return text.split(",")
-        text = f"[{text}]"
     try:
+        if kind in (int, float, str):
+            return kind(text)
+        if kind is tuple and not text.startswith("["):
+            if str in typing.get_args(annotation):
+                return text.split(",")
+            text = f"[{text}]"
         return tomllib.loads(f"value = {text}")["value"]
     except ValueError:
         return text
