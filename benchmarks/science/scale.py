@@ -105,7 +105,7 @@ def table(path: Path, rows: list[list[str]]) -> Table:
     """Return the table of analyses."""
     size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     return Table(
-        f"{N_FRAMES:,} frames x {N_COLUMNS} columns, {size / 1e9:.1f} GB on disk, each in a process of its own.",
+        f"{N_FRAMES:,} frames x {N_COLUMNS} columns, {size / 1e9:.1f} GB on disk, each in a separate process.",
         ["analysis", "s", "s of CPU", "peak memory, MB", "of it before it began, MB"],
         rows,
     )

@@ -155,7 +155,7 @@ def test_vacuum_that_cannot_be_had(scene, make_movie):
         vacuum_level(scene.summed(), (0, 1000, 0, 10))
     with pytest.raises(SettingsError, match="vacuum of a movie needs its box"):
         vacuum_level(make_movie(scene.counts()))
-    with pytest.raises(SettingsError, match="vacuum without counts"):
+    with pytest.raises(SettingsError, match="vacuum has no counts"):
         normalised(draw_tracks(), 0.0)
     with pytest.raises(SettingsError, match="size of a pixel"):
         normalised(draw_tracks().assign_attrs(pixel_size_pm=None), 1.0)

@@ -208,7 +208,7 @@ def test_a_table_may_be_written_by_hand(tmp_path):
         ("atoms,intensity\n1,0.3\n2,bright\n", "line 3"),
         ("atoms,intensity\n0,0.3\n", "line 2"),
         ("atoms,intensity\n1,\n", "line 2"),
-        ("atoms,intensity,site\n1,0.3,a\n1,0.4,a\n", "there twice"),
+        ("atoms,intensity,site\n1,0.3,a\n1,0.4,a\n", "occurs twice"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path, text, message):
@@ -231,7 +231,7 @@ def test_what_is_no_table_is_refused(tmp_path, text, message):
                 "columns": [column_dataset(PLACES).assign(atoms=("column_id", np.full(12, 2)))] * 2,
                 "images": pictures([2, 2]),
             },
-            "there twice",
+            "occurs twice",
         ),
     ],
 )

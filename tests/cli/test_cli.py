@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import operator
 import re
 import signal
 import subprocess
@@ -23,7 +24,7 @@ from tract_dask.errors import ClusterError
 from tract_dask.progress import RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.run import pipeline, session
 from tract_dask.run import plan as run_plan
-from tract_dask.settings import RunSettings, to_toml
+from tract_dask.settings import RunSettings, declare, to_toml
 from tract_dask.store import run_folder
 
 GROUPS = tuple(options.TITLES)
@@ -68,15 +69,113 @@ def inline(monkeypatch):
 
 
 def test_every_setting_has_an_option_with_its_sentence():
-    text = " ".join(tract("run", "--help").output.split())
+    text = " ".join(tract("run", "--help-all").output.split())
     for group in dataclasses.fields(RunSettings()):
         for item in dataclasses.fields(getattr(RunSettings(), group.name)):
             if item.metadata["in_files_only"]:
                 continue
-            flag = item.metadata["flag"] or "--" + item.name.replace("_", "-")
-            assert flag in text
+            assert declare.option(group.name, item) in text
             assert item.metadata["description"] in text
     assert all(title in text for title in options.TITLES.values())
+
+
+def test_help_lists_the_common_options_and_how_to_reach_the_rest():
+    command = cli.main.commands["run"]
+    settings = [option for option in command.params if isinstance(option, options.SettingOption)]
+    common = [option for option in settings if option.common]
+    text = tract("run", "--help").output
+    listed = set(re.findall(r"^  (--[a-z-]+)", text, flags=re.MULTILINE))
+    assert 15 <= len(common) <= 25 < len(settings)
+    assert {option.opts[0] for option in settings} & listed == {option.opts[0] for option in common}
+    assert {"--help-all", "--set", "--config"} <= listed
+    assert len(text.splitlines()) < 100
+
+
+def test_an_option_is_its_setting_with_dashes_after_the_group_where_the_name_alone_says_too_little():
+    grouped = set()
+    for group in dataclasses.fields(RunSettings()):
+        for item in dataclasses.fields(getattr(RunSettings(), group.name)):
+            flag = declare.option(group.name, item)
+            name = item.name.replace("_", "-")
+            assert flag in (f"--{name}", f"--{group.name}-{name}")
+            grouped |= {flag} if flag != f"--{name}" else set()
+    assert grouped == {"--drift-method", "--drift-csv", "--drift-search-px", "--columns-method", "--columns-csv"}
+
+
+@pytest.mark.parametrize(
+    ("assignment", "path", "value"),
+    [
+        ("fit.window_px=31", "fit.window_px", 31),
+        ("fit.window_px=unset", "fit.window_px", None),
+        ("fit.vacuum_box=0,8,0,9", "fit.vacuum_box", (0, 8, 0, 9)),
+        ("fit.vacuum_box=[0, 8, 0, 9]", "fit.vacuum_box", (0, 8, 0, 9)),
+        ("fit.counting=false", "fit.counting", False),
+        ("fit.threshold=2", "fit.threshold", 2.0),
+        ("columns.csv=my table=1.csv", "columns.csv", "my table=1.csv"),
+        ("columns.csv=a.csv", "columns.method", "csv"),
+        ("columns.lattices={origin = [1, 2]}", "columns.lattices", ({"origin": [1, 2]},)),
+        ("columns.lattices=unset", "columns.method", "auto"),
+        ("convert.codec=zstd", "convert.codec", "zstd"),
+        ("cluster.threads=2", "cluster.threads", 2),
+        ("cluster.slurm.queue=short", "cluster.slurm.queue", "short"),
+        ("cluster.ssh.hosts=node1,10.0.0.2", "cluster.ssh.hosts", ("node1", "10.0.0.2")),
+    ],
+)
+def test_any_setting_can_be_set(captured, tmp_path, assignment, path, value):
+    (tmp_path / "run.toml").write_text("[fit]\nwindow_px = 21\nthreshold = 3.0\n")
+    result = tract("run", "m.tif", "out", "--config", tmp_path / "run.toml", "--blur-sigma-px", 1, "--set", assignment)
+    assert result.exit_code == 0, result.output
+    assert operator.attrgetter(path)(captured["settings"]) == value
+    assert captured["settings"].fit.blur_sigma_px == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "assignment", "message"),
+    [
+        ("run m out", "fit.threshold=1000", "setting threshold .*at least 0 and at most 100; got 1000"),
+        ("run m out", "fit.threshold=high", "setting threshold .*float; got 'high'"),
+        ("run m out", "fit.window_px=2.5", "setting window_px .*int; got '2.5'"),
+        ("run m out", "fit.threshold=unset", "setting threshold .*float; got 'unset'"),
+        ("run m out", "columns.lattices={", "setting lattices .*list; got"),
+        ("run m out", "fit.vacuum_box=1,high", "setting vacuum_box .*list; got"),
+        ("run m out", "convert.codec=zip", "setting codec .*one of lz4, zstd, none; got 'zip'"),
+        ("run m out", "fit.window=3", "no setting 'window'.*one of window_px, .*got fit.window"),
+        ("run m out", "fits.window_px=3", "no setting 'fits'.*one of source, .*got fits.window_px"),
+        ("run m out", "fit.window_px.x=3", "no setting 'x'.*fit.window_px without a further name"),
+        ("run m out", "fit=3", "group.name=value; got fit=3"),
+        ("run m out", "fit.window_px", "group.name=value; got fit.window_px"),
+        ("drift m.zarr d.zarr", "fit.window_px=31", "a setting of drift, cluster; got fit.window_px"),
+        ("columns m.zarr c.csv", "fit.threshold=2", "fit.window_px, fit.blur_sigma_px, cluster; got fit.threshold"),
+        ("submit m.tif", "cluster.workers=2", "a setting of source, .*fit; got cluster.workers"),
+    ],
+)
+def test_set_names_the_setting_its_range_and_what_it_got(captured, command, assignment, message):
+    result = tract(*command.split(), "--set", assignment)
+    assert result.exit_code == 2, result.output
+    assert re.search(message, result.stderr)
+    assert not captured
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run",
+        "inspect",
+        "convert",
+        "drift",
+        "columns",
+        "fit",
+        "demo",
+        "compare-filters",
+        "submit",
+        "serve",
+        "simulate table",
+    ],
+)
+def test_commands_with_settings_take_them_all_alike(command):
+    text = tract(*command.split(), "--help").output
+    assert {"--set", "--config", "--help-all"} <= set(re.findall(r"^  (--[a-z-]+)", text, flags=re.MULTILINE))
+    assert len(tract(*command.split(), "--help-all").output) >= len(text)
 
 
 def test_options_override_the_configuration(captured, tmp_path):
@@ -94,7 +193,7 @@ def test_options_override_the_configuration(captured, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "group", "expected"),
     [
-        (("--columns", "a.csv"), "columns", {"method": "csv", "csv": "a.csv"}),
+        (("--columns-csv", "a.csv"), "columns", {"method": "csv", "csv": "a.csv"}),
         (("--drift-csv", "d.csv"), "drift", {"method": "csv", "csv": "d.csv"}),
         (("--no-drift",), "drift", {"method": "none"}),
         (("--no-refine-drift",), "fit", {"refine_drift": False}),
@@ -116,11 +215,11 @@ def test_options_become_settings(captured, arguments, group, expected):
     ("arguments", "message"),
     [
         (("--threshold", "1000"), "out of range"),
-        (("--threshold", "high"), "not a valid float"),
+        (("--threshold", "high"), "setting threshold (FitSettings): the value is of the wrong type. Expected float"),
         (("--codec", "zip"), "zip"),
-        (("--vacuum-box", "1;2"), "commas"),
-        (("--lattices", "{"), "not TOML"),
-        (("--lattices", "3"), "not a list"),
+        (("--vacuum-box", "1;2"), "setting vacuum_box (FitSettings): the value is of the wrong type. Expected list"),
+        (("--lattices", "{"), "setting lattices (ColumnSettings): the value is of the wrong type. Expected list"),
+        (("--window-px", "2.5"), "setting window_px (FitSettings): the value is of the wrong type. Expected int"),
         (("--config", "nowhere.toml"), "cannot be read"),
         (("--no-such-option",), "No such option"),
     ],

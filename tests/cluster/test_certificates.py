@@ -165,7 +165,7 @@ def test_what_cannot_be_used_is_said(tmp_path):
     (tmp_path / "pair" / SERVICE_KEY).write_bytes((tmp_path / DASK_KEY).read_bytes())
     with pytest.raises(InputError, match="not a pair"):
         check_certificates(tmp_path / "pair")
-    with pytest.raises(DestinationError, match="half of an authority"):
+    with pytest.raises(DestinationError, match="authority is incomplete"):
         make_certificates(tmp_path / "pair")
     (tmp_path / "pair" / SERVICE).write_text("no certificate")
     with pytest.raises(InputError, match="not a certificate"):

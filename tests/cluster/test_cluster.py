@@ -164,7 +164,7 @@ def test_two_schedulers_contradict():
 
 
 def test_memory_limit_that_is_no_size():
-    with pytest.raises(SettingsError, match="no size"):
+    with pytest.raises(SettingsError, match="not a size"):
         cluster.local_memory_limit(ClusterSettings(memory_limit="lots"))
 
 
@@ -275,7 +275,7 @@ def test_cluster_file_takes_the_place_of_the_cluster_in_the_configuration(tmp_pa
         ('kind = "ssh"', r"hosts in the table \[ssh\]"),
         ('kind = "local"\nscheduler = "tcp://a:1"', "contradict"),
         ('kind = "slurm"\nworkers = 2\nmin_workers = 3\nmemory_limit = "1GB"', "at most workers, 2"),
-        ('[slurm]\nwalltime = "an hour"', "another form"),
+        ('[slurm]\nwalltime = "an hour"', "wrong form"),
         ('[slurm]\ndirectives = ["exclusive"]', "begin with a dash"),
         ("[slurm]\ndirectives = [7]", "begin with a dash"),
         ('[slurm]\nqueue = "a b"', "letters, digits"),

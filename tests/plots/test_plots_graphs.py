@@ -232,7 +232,7 @@ def test_presence_is_a_raster_with_its_events(tracks):
 def test_figures_that_do_not_exist_and_runs_that_are_not_there_are_refused(tmp_path):
     with pytest.raises(SettingsError, match="nonsense"):
         draw_figures(tmp_path, only=["nonsense"])
-    with pytest.raises(StoreError, match="no finished run"):
+    with pytest.raises(StoreError, match="not a finished run"):
         draw_figures(tmp_path)
     result = CliRunner().invoke(main, ["figures", str(tmp_path), "--only", "sum,nonsense"])
     assert result.exit_code == 2

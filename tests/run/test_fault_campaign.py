@@ -33,7 +33,7 @@ campaign = SimpleNamespace(**runpy.run_path(str(ROOT / "scripts" / "fault_campai
     [
         (0, "", ""),
         (1, "Error: /x/movie.zarr: damaged. Remove it.", ""),
-        (1, "Error: unexpected KeyError: 'a'. Say --debug to see where", "TRACEBACK"),
+        (1, "Error: unexpected KeyError: 'a'. Add --debug to see where", "TRACEBACK"),
         (1, "Traceback (most recent call last):\n...", "TRACEBACK"),
         (None, "", "HANG"),
     ],
@@ -54,7 +54,7 @@ def test_the_advice_of_an_error_is_followed(tmp_path):
     assert [path.name for path in output.iterdir()] == ["sum.zarr"]
     assert campaign.follow("the disk is full: make room", output) == ()
     assert campaign.follow("Remove /etc/passwd", output) == ()
-    assert campaign.follow("say --overwrite to discard it", output) == ("--overwrite",)
+    assert campaign.follow("use --overwrite to discard it", output) == ("--overwrite",)
     assert (output / "sum.zarr").exists()
 
 

@@ -223,7 +223,7 @@ def test_memory_is_checked_before_work(job, monkeypatch):
 def test_folder_that_holds_something_else_is_left_alone(job):
     job.output.mkdir()
     (job.output / "thesis.txt").write_text("years of work")
-    with pytest.raises(DestinationError, match="holds something else") as caught:
+    with pytest.raises(DestinationError, match="already holds other files") as caught:
         job()
     assert "thesis.txt" in caught.value.got
     job(overwrite=True)
@@ -232,7 +232,7 @@ def test_folder_that_holds_something_else_is_left_alone(job):
 
 def test_file_in_the_place_of_the_folder(job):
     job.output.write_text("")
-    with pytest.raises(DestinationError, match="holds something else"):
+    with pytest.raises(DestinationError, match="the output is not a folder"):
         job(overwrite=True)
 
 
@@ -266,7 +266,7 @@ def test_frames_with_nan_end_as_bad_frames(npy, scene, tmp_path, client):
         ({"columns": {"method": "csv"}}, "needs a file"),
         ({"columns": {"method": "csv", "csv": "nowhere.csv"}}, "nowhere.csv"),
         ({"drift": {"method": "csv", "csv": "nowhere.csv"}}, "nowhere.csv"),
-        ({"cluster": {"memory_limit": "much"}}, "no size"),
+        ({"cluster": {"memory_limit": "much"}}, "not a size"),
     ],
 )
 def test_faults_in_small_inputs_are_found_before_anything_is_written(job, changed, message):
@@ -474,7 +474,7 @@ def test_what_has_the_place_of_a_store_is_not_deleted(done, name, kind):
     mine = done.output / name / "notes.txt" if kind == "folder" else done.output / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
-    with pytest.raises(DestinationError, match="holds something else"):
+    with pytest.raises(DestinationError, match="already holds other data"):
         done()
     assert done.events == []
     assert mine.read_text() == "mine"

@@ -138,7 +138,7 @@ def test_all_pages_are_read(client, jobs, monkeypatch):
         (lambda client: client.submit("gone.npy"), MissingStoreError, "gone.npy: there is no such file"),
         (lambda client: client.submit("notes.txt"), SourceError, "notes.txt: the format is unknown"),
         (lambda client: client.submit("movie.npy", {"fit": {"window_px": 8}}), SettingsError, "odd number from 5 to"),
-        (lambda client: client.submit("movie.npy", output="sub"), DestinationError, "holds something else"),
+        (lambda client: client.submit("movie.npy", output="sub"), DestinationError, "already holds other files"),
         (lambda client: client.submit("../x"), InputError, "data root"),
         (lambda client: client.job("0123456789"), InputError, "0123456789: there is no such job"),
         (lambda client: client.job("nothing"), InputError, "pattern"),
@@ -216,7 +216,7 @@ def test_a_service_that_is_not_there_is_said_to_be(tmp_path):
             client.jobs()
         with pytest.raises(ServiceError, match="cannot be reached"):
             client.wait("0123456789")
-    for wrong, words in (("localhost:8000", "no address"), ("ftp://x", "no address")):
+    for wrong, words in (("localhost:8000", "not an address"), ("ftp://x", "not an address")):
         with pytest.raises(InputError, match=words):
             ServiceClient(wrong)
     with pytest.raises(InputError, match="certificate"):
@@ -336,7 +336,7 @@ def test_the_commands(service, client, jobs, monkeypatch):
         assert found.exit_code == code, found.output
         return found
 
-    assert "There are no such jobs" in command("jobs").stdout
+    assert "No jobs found" in command("jobs").stdout
     wrong = command("submit", "movie.npy", "--window-px", "8", code=2)
     assert "odd number" in wrong.stderr
     submitted = command("submit", "movie.npy", "--window-px", "9", "--label", "mine", "--curate", "--json")

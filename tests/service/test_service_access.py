@@ -596,7 +596,7 @@ def test_serve_warns_of_what_is_not_encrypted(tmp_path):
         ClusterSettings(scheduler_file="scheduler.json"),
         ClusterSettings(kind="ssh", ssh=SshSettings(hosts=("node1",))),
     ):
-        with pytest.raises(InputError, match="tokens would keep nobody out") as caught:
+        with pytest.raises(InputError, match="tokens would not protect the service") as caught:
             notes(open_to_all, tokens=True)
         assert "--tls" in caught.value.remedy
     assert notes(ClusterSettings(kind="local"), tokens=True) == ""

@@ -81,7 +81,7 @@ DEEP: dict = {"columns": {"lattices": [{"a": [[[[[1]]]]]}]}}
         ({"source": "x" * 5000}, 422, ["source"]),
         ({"source": "movie.npy", "label": "x" * 201}, 422, ["label"]),
         ({"source": "movie.npy", "labl": "x"}, 422, ["labl"]),
-        ({"source": "movie.npy", "output": "sub"}, 400, ["sub", "something else"]),
+        ({"source": "movie.npy", "output": "sub"}, 400, ["sub", "already holds other files"]),
         ({"source": "movie.npy", "output": "notes.txt"}, 400, ["notes.txt"]),
         ({"source": "movie.npy", "output": ".."}, 403, []),
         ({"source": "movie.npy", "output": ".tract_dask/x"}, 403, ["service's own"]),

@@ -84,7 +84,7 @@ def test_a_file_that_hangs_its_reader_is_named(deadly, monkeypatch):
     monkeypatch.setattr(deadly.app.state.workshop, "run", soon)
     answer = deadly.get("files/about", params={"path": "bad.hang"})
     assert answer.status_code == 422
-    assert "does not come to an end" in answer.json()["error"]["what"]
+    assert "did not finish" in answer.json()["error"]["what"]
 
 
 # --- tables, lattices, lists -----------------------------------------------------------------------------------------

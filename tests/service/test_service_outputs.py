@@ -162,7 +162,7 @@ def test_a_copy_of_a_folder_is_nobodys(app, root, clients):
     assert answer.status_code == 400
     for text in ("", "{", "[]", '{"owner": "ana"}', json.dumps({"owner": "ana", "job": "x", "output": "one"})):
         (root / "two" / MARK).write_text(text)
-        with pytest.raises(DestinationError, match="something else"):
+        with pytest.raises(DestinationError, match="already holds other files"):
             check_owner(DataRoot(root), Mark("ana", "", "two"))
 
 

@@ -296,8 +296,8 @@ def test_without_a_pixel_size_lengths_are_in_px(service):
     [
         ("/series/99", 400, "there is no such column"),
         ("/series/0x1", 422, "integer"),
-        ("/series/1?start=30", 400, "these are no frames"),
-        ("/series/1?start=3&stop=3", 400, "these are no frames"),
+        ("/series/1?start=30", 400, "start and stop are not a valid range of frames"),
+        ("/series/1?start=3&stop=3", 400, "start and stop are not a valid range of frames"),
         ("/series/1?points=1", 422, "greater than or equal to 2"),
         ("/displacement?first=0&second=23", 400, "there is no such frame"),
         ("/displacement?first=-1&second=2", 422, "greater than or equal to 0"),

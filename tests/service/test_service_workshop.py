@@ -193,7 +193,7 @@ def test_a_killed_process_is_not_the_file_s_fault(workshop, tmp_path):
 def test_a_reader_that_does_not_come_to_an_end_is_ended_and_its_file_named(workshop, tmp_path):
     file = tmp_path / "endless.tif"
     file.touch()
-    with pytest.raises(CrashError, match=r"endless.tif: the reader does not come to an end with this file"):
+    with pytest.raises(CrashError, match=r"endless.tif: the reader did not finish with this file in time"):
         asked(workshop, time.sleep, 60, timeout_s=0.2, about=file)
     began = time.monotonic()
     with pytest.raises(CrashError):

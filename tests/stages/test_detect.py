@@ -96,7 +96,7 @@ def test_a_template_is_cut_where_it_is_named(scene):
     found = detect_columns(scene.summed(), "template", settings=settings)
     missed, _ = misses(found_at(found), scene.place)
     assert missed.max() <= 1.0
-    for at, match in (((1, 1), "no column to make the template"), ((3,), "no place")):
+    for at, match in (((1, 1), "no column to make the template"), ((3,), "needs x,y")):
         with pytest.raises(InputError, match=match):
             detect_columns(scene.summed(), "template", settings=ColumnSettings(spacing_px=SPACING, template=at))
 

@@ -280,7 +280,7 @@ def test_method_csv_needs_a_file():
         ("frame,y,x\n0,1,nan\n", r"line 2: the drift is not finite"),
         ("frame,y,x\n0,1,1\n2,1,1\n", r"line 3: there is no such frame. Expected 0 to 1; got 2"),
         ("frame,y,x\n0.5,1,1\n", r"line 2: there is no such frame"),
-        ("frame,y,x\n0,1,1\n0,1,1\n", r"line 3: frame 0 is there twice.*line 2"),
+        ("frame,y,x\n0,1,1\n0,1,1\n", r"line 3: frame 0 occurs twice.*line 2"),
         ("frame,y,x\n1,1,1\n", r"frames are missing.*the first one missing is 0"),
     ],
 )

@@ -57,7 +57,7 @@ def test_the_journal_remembers_and_forgets_other_keys(tmp_path):
 def test_a_destination_that_holds_something_else_is_refused(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
-    with pytest.raises(DestinationError, match="holds something else"):
+    with pytest.raises(DestinationError, match="already holds other data"):
         metadata.check_destination(tmp_path / "mine")
     with pytest.raises(DestinationError, match="cannot be written"):
         metadata.check_destination(tmp_path / "mine" / "thesis.txt" / "movie.zarr")

@@ -301,7 +301,7 @@ def arrays_of(store: Path) -> dict[str, bytes]:
 
 def test_damaged_columns_ask_for_the_table_too(run, copy):
     (copy / "columns.zarr" / "x_ref" / "c.0").write_bytes(b"")
-    with pytest.raises(StoreError, match=r"columns\.csv.*--columns") as told:
+    with pytest.raises(StoreError, match=r"columns\.csv.*--columns-csv") as told:
         again(copy, run.parent / "movie.npy")
     assert "columns.zarr" in told.value.where
     shutil.rmtree(copy / "columns.zarr")
@@ -423,10 +423,15 @@ BESIDE = {
         "run.toml",
         lambda data: data[:100] + b"\xff\x00" + data[100:],
         "damaged",
-        "writes the file anew",
+        "writes the file again",
     ),
-    "run.toml gone": ("run.toml", None, "missing", "writes the file anew"),
-    "a setting unknown": ("run.toml", lambda data: data.replace(b"threshold", b"thresold"), "damaged", "anew"),
+    "run.toml gone": ("run.toml", None, "missing", "writes the file again"),
+    "a setting unknown": (
+        "run.toml",
+        lambda data: data.replace(b"threshold", b"thresold"),
+        "damaged",
+        "writes the file again",
+    ),
     "columns.csv cut": (
         "columns.csv",
         lambda data: data[: data.index(b"\n", 200) + 5],
@@ -434,7 +439,7 @@ BESIDE = {
         "columns.csv, or remove",
     ),
     "columns.csv empty": ("columns.csv", lambda data: b"", "damaged", "columns.csv, or remove"),
-    "columns.csv gone": ("columns.csv", None, "missing", "columns are found anew"),
+    "columns.csv gone": ("columns.csv", None, "missing", "columns are found again"),
     "figure flipped": ("columns.png", lambda data: data[:-30] + b"\0" * 3 + data[-27:], "damaged", "Remove"),
     "figure cut": ("columns.png", lambda data: data[:-12], "damaged", "Remove"),
     "report cut": ("report.html", lambda data: b"<html><body>", "damaged", "tract-dask report"),
@@ -505,7 +510,7 @@ def test_verify_reads_the_parts_of_a_fit_that_is_not_finished(copy):
     part.write_bytes(data)
     (fault,) = (found := verify(store)).faults
     assert (fault.file, fault.what, fault.frames) == (journal.path, "damaged", (0, step))  # a short part
-    assert found.remedies == ["Run the same command again: it makes anew what is damaged"]
+    assert found.remedies == ["Run the same command again: it makes again what is damaged"]
 
 
 def test_verify_says_where_there_is_nothing(tmp_path):

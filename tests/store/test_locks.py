@@ -200,7 +200,7 @@ def test_a_pipe_is_not_waited_for_and_a_link_not_followed(lock, tmp_path):
     take(lock)
     lock.unlink()
     lock.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DestinationError, match="cannot be held"):
+    with pytest.raises(DestinationError, match="cannot be locked"):
         take(lock)
     assert not (tmp_path / "elsewhere").exists()
 
@@ -218,7 +218,7 @@ def test_a_folder_can_be_deleted_by_who_holds_it(tmp_path):
 
 def test_a_disk_error_says_so(lock, monkeypatch):
     without_locks(monkeypatch, errno.EIO)
-    with pytest.raises(DestinationError, match=r"cannot be held against other processes.*error"):
+    with pytest.raises(DestinationError, match=r"cannot be locked.*error"):
         take(lock)
 
 

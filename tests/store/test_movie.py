@@ -486,7 +486,7 @@ def test_a_killed_conversion_ends_as_an_undisturbed_one(tmp_path, seconds):
 def test_a_folder_of_other_files_is_never_replaced(tmp_path, source, overwrite):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.txt").write_text("all of it")
-    with pytest.raises(DestinationError, match="holds something else"):
+    with pytest.raises(DestinationError, match="already holds other"):
         convert(source, tmp_path / "thesis", overwrite=overwrite)
     assert (tmp_path / "thesis" / "chapter.txt").read_text() == "all of it"
 
@@ -494,7 +494,7 @@ def test_a_folder_of_other_files_is_never_replaced(tmp_path, source, overwrite):
 def test_a_file_is_replaced_only_when_told(tmp_path, source, counts):
     path = tmp_path / "notes.txt"
     path.write_text("something")
-    with pytest.raises(DestinationError, match="holds something else"):
+    with pytest.raises(DestinationError, match="already holds other"):
         convert(source, path)
     assert path.read_text() == "something"
     convert(source, path, overwrite=True)
@@ -546,7 +546,7 @@ def test_a_source_that_changes_meanwhile_is_told(tmp_path, source, counts):
         if isinstance(event, ShardDone) and event.shard == 0:
             save(source, counts[:, :100])
 
-    with pytest.raises(SourceError, match="not what it was"):
+    with pytest.raises(SourceError, match="has changed since"):
         convert(source, tmp_path / "movie.zarr", settings=SMALL, on_event=shrink)
 
 

@@ -63,7 +63,7 @@ def rebin_frames(movie: Movie, n: int, drift: xr.Dataset | None = None) -> Summe
     """
     if not 1 <= n <= movie.n_frames:
         raise SettingsError(
-            "frames cannot be summed so", "rebin_frames: n", f"1 to {movie.n_frames} frames in a sum", f"{n}"
+            "the sum is out of range", "rebin_frames: n", f"1 to {movie.n_frames} frames in a sum", f"{n}"
         )
     n_sums = movie.n_frames // n
     measured = schema.drift_of(drift, movie.n_frames)[: n_sums * n].reshape(n_sums, n, 2)

@@ -198,7 +198,7 @@ def normalised(tracks: xr.Dataset, vacuum: xr.Dataset | xr.DataArray | float) ->
     level, error = (vacuum["level"], vacuum["stderr"]) if isinstance(vacuum, xr.Dataset) else (vacuum, 0.0)
     if not (isinstance(level, xr.DataArray) and level.chunks) and not np.all(np.asarray(level) > 0):
         raise SettingsError(
-            "vacuum without counts is no unit", "normalised: vacuum", "more than 0", f"{np.min(level):g}", "See its box"
+            "the vacuum has no counts", "normalised: vacuum", "more than 0", f"{np.min(level):g}", "See its box"
         )
     tracks = accepted(tracks)
     unit = level / (pixel_size_pm(tracks) / 100) ** 2  # counts in a square angstrom of vacuum
@@ -244,7 +244,9 @@ def mean_intensity(tracks: xr.Dataset, frames: int | None = None) -> xr.Dataset:
     n_frames = tracks.sizes["frame"]
     frames = n_frames if frames is None else frames
     if not 1 <= frames <= n_frames:
-        raise SettingsError("frames cannot be averaged so", "mean_intensity: frames", f"1 to {n_frames}", f"{frames}")
+        raise SettingsError(
+            "the number of frames in a mean is out of range", "mean_intensity: frames", f"1 to {n_frames}", f"{frames}"
+        )
     groups = n_frames // frames
     used = tracks[["intensity", "intensity_stderr"]].isel(frame=slice(groups * frames))
     parts = used.coarsen(frame=frames).construct(frame=("frame", "part"))

@@ -314,7 +314,7 @@ def _by_site(intensity: Floats, atoms: NDArray[np.int64], site: NDArray[np.str_]
     if len(set(pairs)) < len(pairs):
         first = next(pair for pair in pairs if pairs.count(pair) > 1)
         raise SettingsError(
-            "a site is there twice",
+            "a site occurs twice",
             where,
             "one intensity for each number of atoms and site",
             f"{first[0]} atoms at site {first[1]}",

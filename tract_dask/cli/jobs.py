@@ -17,7 +17,7 @@ from ..errors import ExitCode, InputError
 from ..progress import Event, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 from ..service.jobs.states import State
 from ..settings.run import RunSettings
-from .options import setting_options
+from .options import Command, setting_options
 from .show import PATH, common_options, show
 
 if TYPE_CHECKING:
@@ -50,23 +50,23 @@ def service_options(function: F) -> F:
     decorated: Any = command
     for option in (
         click.option("--ca", type=PATH, envvar="TRACT_DASK_CA", help="Certificate of the service's authority, ca.pem."),
-        click.option("--token-file", type=PATH, help=f"File with the token; otherwise {TOKEN_VARIABLE} has it."),
+        click.option("--token-file", type=PATH, help=f"File with the token; otherwise {TOKEN_VARIABLE} is used."),
         click.option(
             "--server",
             default="http://127.0.0.1:8000",
             envvar="TRACT_DASK_SERVER",
             metavar="URL",
-            help="The service, or TRACT_DASK_SERVER. [http://127.0.0.1:8000].",
+            help="Address of the service; also TRACT_DASK_SERVER. [http://127.0.0.1:8000].",
         ),
     ):
         decorated = option(decorated)
     return cast("F", decorated)
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("source")
-@click.option("--output", default="", metavar="FOLDER", help="Folder under the data root; otherwise one of its own.")
-@click.option("--label", default="", metavar="TEXT", help="To find it again.")
+@click.option("--output", default="", metavar="FOLDER", help="Folder under the data root; otherwise a new one.")
+@click.option("--label", default="", metavar="TEXT", help="Text by which to find the job.")
 @click.option("--curate", is_flag=True, help="Stop after the summed image, for columns to be edited by hand.")
 @click.option("--watch", "watching", is_flag=True, help="Show its progress until it ends.")
 @service_options
@@ -89,10 +89,10 @@ def submit(
 
 @click.command()
 @click.option(
-    "--state", "states", multiple=True, type=click.Choice([*map(str, State)]), help="Only those; may be repeated."
+    "--state", "states", multiple=True, type=click.Choice([*map(str, State)]), help="Only in this state; repeatable."
 )
-@click.option("--owner", default="", metavar="NAME", help="Only this owner's.")
-@click.option("--text", default="", metavar="TEXT", help="Only those with this in label, source, owner or id.")
+@click.option("--owner", default="", metavar="NAME", help="Only jobs of this owner.")
+@click.option("--text", default="", metavar="TEXT", help="Only jobs with this text in label, source, owner or id.")
 @click.option("--limit", default=20, show_default=True, type=click.IntRange(1), help="Most jobs, the newest first.")
 @service_options
 @common_options
@@ -122,7 +122,7 @@ def watch(job: str, service: ServiceClient, *, as_json: bool) -> None:
 @service_options
 @common_options
 def cancel(job: str, service: ServiceClient, *, as_json: bool) -> None:
-    """Cancel JOB; what it has done is kept, and can be gone on from."""
+    """Cancel JOB; what is done is kept, and can be continued."""
     _show_job(service.cancel(service.find(job).id), service, as_json=as_json)
 
 
@@ -235,7 +235,7 @@ def _print_table(found: list[ServiceJob]) -> None:
             job.label,
             job.source,
         )
-    console.print(table if found else "There are no such jobs.")
+    console.print(table if found else "No jobs found.")
 
 
 def _farewell(job: ServiceJob) -> str:

@@ -50,7 +50,7 @@ class Group(click.Group):
             self._explain(ctx, f"Error: {error}", error.exit_code)
         except Exception as error:  # noqa: BLE001  the last resort of the command line, which has to explain itself
             said = str(error).rstrip(".")
-            text = f"Error: unexpected {type(error).__name__}: {said}. Say --debug to see where; what is done is kept."
+            text = f"Error: unexpected {type(error).__name__}: {said}. Add --debug to see where; what is done is kept."
             self._explain(ctx, text, ExitCode.FAILED)
 
     def _explain(self, ctx: click.Context, text: str, code: int) -> None:

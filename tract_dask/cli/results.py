@@ -17,7 +17,7 @@ from .show import PATH, common_options, progress, show
 
 @click.command(cls=Command)
 @click.argument("path", type=PATH, metavar="OUTPUT")
-@click.option("--repair", is_flag=True, help="Then make what is damaged in a movie anew, from its source.")
+@click.option("--repair", is_flag=True, help="Then make what is damaged in a movie again, from its source.")
 @common_options
 def verify(path: Path, *, repair: bool, as_json: bool) -> None:
     """Read all that the run in the folder OUTPUT wrote, and name what is damaged or missing.
@@ -86,7 +86,7 @@ def compare_filters(
 def report(folder: Path, file: Path | None, *, as_json: bool) -> None:
     """Write what the run in the folder OUTPUT measured, and how well, as one HTML file.
 
-    Every run ends with one; this makes it anew. The file needs neither other files nor a network.
+    Every run writes one at its end; this writes it again. The file needs neither other files nor a network.
     """
     from ..report.page import write_report
 
@@ -132,7 +132,7 @@ def export(results: Path, file: Path, *, overwrite: bool, accepted_only: bool, a
 @click.option("--only", metavar="NAME,NAME,...", help="Names of figures; unset: those that need no further fits.")
 @click.option("--table", type=PATH, help="A look-up table (.csv), for numbers of atoms.")
 @click.option(
-    "--format", "suffix", default="png", type=click.Choice(["png", "pdf", "svg"]), help="Of the files. [png]."
+    "--format", "suffix", default="png", type=click.Choice(["png", "pdf", "svg"]), help="Format of the files. [png]."
 )
 @common_options
 def figures(

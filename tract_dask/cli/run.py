@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from ..run.plan import Plan
 from .show import exit_for, overwrite_option, progress
 
-drift_option = click.option("--drift-from", type=PATH, help="The drift, as tract-dask drift wrote it; otherwise none.")
+drift_option = click.option("--drift-from", type=PATH, help="Drift written by tract-dask drift; unset: no drift.")
 
 
 @click.command(cls=Command)
 @click.argument("source")
 @click.argument("output", type=PATH)
-@click.option("--plan", "plan_only", is_flag=True, help="Print what would be done, and stop.")
+@click.option("--plan", "plan_only", is_flag=True, help="Print what the run would do, and stop.")
 @click.option("--report/--no-report", default=True, help="Write report.html at the end [on].")
 @click.option("--until", type=click.Choice(STAGES[:-1]), help="Stop after this stage, such as to edit columns.csv.")
 @overwrite_option
@@ -33,7 +33,7 @@ drift_option = click.option("--drift-from", type=PATH, help="The drift, as tract
 def run(source: str, output: Path, settings: RunSettings, *, as_json: bool, **options: Any) -> None:
     """Turn the movie SOURCE into tracks in the folder OUTPUT.
 
-    Run it again to go on where it was stopped; changed settings redo only what they affect.
+    Run it again to continue an interrupted run; changed settings redo only what they affect.
     """
     get_ready(settings)
     from ..run.pipeline import run as run_stages
@@ -91,7 +91,7 @@ def drift(movie: Path, output: Path, settings: RunSettings, *, as_json: bool) ->
 @click.command(cls=Command)
 @click.argument("movie", type=PATH)
 @click.argument("output", type=PATH)
-@click.option("--edit", is_flag=True, help="Then edit them in the browser; what is saved there is written to OUTPUT.")
+@click.option("--edit", is_flag=True, help="Then edit the columns in the browser; saved changes go to OUTPUT.")
 @drift_option
 @overwrite_option
 @common_options
@@ -108,7 +108,7 @@ def columns(
 ) -> None:
     """Find the columns of the store MOVIE, into OUTPUT (.csv).
 
-    They are looked for in the movie's drift-corrected sum; a figure of them is written beside the table.
+    They are found in the movie's drift-corrected sum; a figure of them is written next to the table.
     """
     get_ready(settings)
     from ..run.one_stage import run_columns
@@ -132,7 +132,7 @@ def fit(
 ) -> None:
     """Fit COLUMNS (.csv) in all frames of MOVIE, into RESULTS.
 
-    MOVIE and RESULTS are stores (.zarr); what RESULTS has from an interrupted fit is kept.
+    MOVIE and RESULTS are stores (.zarr); fits of an interrupted run in RESULTS are kept.
     """
     get_ready(settings)
     from ..run.one_stage import run_fit
@@ -151,7 +151,7 @@ def fit(
 def demo(folder: Path, settings: RunSettings, *, frames: int, as_json: bool) -> None:
     """Track a simulated movie, and compare with its truth.
 
-    The movie is a drifting low-dose one of CeO2; everything goes to FOLDER.
+    The movie shows drifting CeO2 at low dose; everything is written to FOLDER.
     """
     from ..run.demo import run_demo
 

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from ..settings.run import RunSettings
-from .options import setting_options
+from .options import Command, setting_options
 from .show import PATH, Subgroup, common_options, debug_option, show
 
 data_root_option = click.option(
@@ -26,29 +26,27 @@ state_dir_option = click.option(
     type=PATH,
     envvar="TRACT_DASK_STATE_DIR",
     show_envvar=True,
-    help="Folder of the service's own store, with the tokens; else one of the data root's own in ~/.local/state.",
+    help="Folder of the store of jobs and tokens; unset: one for this data root in ~/.local/state.",
 )
 
 
-@click.command()
+@click.command(cls=Command)
 @data_root_option
 @state_dir_option
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on; any other demands tokens.")
-@click.option(
-    "--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
-)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on; others require tokens.")
+@click.option("--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: a free one.")
 @click.option("--concurrency", default=1, show_default=True, type=click.IntRange(1, 64), help="Jobs at the same time.")
-@click.option("--certs", "certificates", type=PATH, help="Folder of tract-dask certs; speak https with it.")
-@click.option("--tokens", is_flag=True, help="Demand tokens from this machine's users too.")
-@click.option("--allowed-host", "allowed_hosts", multiple=True, metavar="NAME", help="Another name of it; repeatable.")
+@click.option("--certs", "certificates", type=PATH, help="Folder of tract-dask certs, for https.")
+@click.option("--tokens", is_flag=True, help="Require tokens from users of this machine too.")
+@click.option("--allowed-host", "allowed_hosts", multiple=True, metavar="NAME", help="Further host name; repeatable.")
 @click.option("--trusted-proxy", default="", metavar="ADDRESS", help="Reverse proxy whose X-Forwarded headers count.")
 @debug_option
 @setting_options("cluster")
 def serve(settings: RunSettings, **options: Any) -> None:
     """Serve jobs, their results and pages to watch them.
 
-    Jobs and tokens are kept in the state folder, which lies outside of the data root. Stop it, or lose the machine:
-    started again, it goes on with every job.
+    Jobs and tokens are kept in the state folder, outside of the data root. After a stop or a crash, start it again:
+    it continues every job.
     """
     from ..cluster.forkserver import uncollected  # which Windows has not
 
@@ -61,23 +59,25 @@ def serve(settings: RunSettings, **options: Any) -> None:
 
 @click.group(cls=Subgroup)
 def token() -> None:
-    """Create, list and revoke the tokens with which one asks the service.
+    """Create, list and revoke tokens for the service.
 
-    A service that runs knows of every change at once.
+    A running service applies every change at once.
     """
 
 
 @token.command(name="create")
 @click.argument("name")
-@click.option("--role", default="user", type=click.Choice(("admin", "user", "monitor")), help="What it may do. [user].")
-@click.option("--file", type=PATH, help="Write it there, readable by you only, and do not print it.")
+@click.option(
+    "--role", default="user", type=click.Choice(("admin", "user", "monitor")), help="Rights of the token. [user]."
+)
+@click.option("--file", type=PATH, help="Write the token to this file, readable by you only, and do not print it.")
 @data_root_option
 @state_dir_option
 @common_options
 def token_create(
     name: str, data_root: Path, state_dir: Path | None, *, role: str, file: Path | None, as_json: bool
 ) -> None:
-    """Create a token for NAME, and show it this once.
+    """Create a token for NAME, and show it once.
 
     A user submits jobs and changes their own; an admin changes all; a monitor reads health and metrics only.
     """
@@ -93,7 +93,7 @@ def token_create(
 @state_dir_option
 @common_options
 def token_list(data_root: Path, state_dir: Path | None, *, as_json: bool) -> None:
-    """List the tokens, the revoked ones too; their secrets are known to nobody but their holders."""
+    """List the tokens, the revoked ones too, without their secrets."""
     from ..service.config import ServiceConfig
     from ..service.server import list_tokens
 
@@ -124,13 +124,13 @@ def token_revoke(name: str, data_root: Path, state_dir: Path | None, *, as_json:
 @click.command()
 @click.argument("folder", type=PATH, metavar="DIR")
 @click.option("--host", "hosts", multiple=True, metavar="NAME", help="Name or address of a machine; may be repeated.")
-@click.option("--days", default=825, show_default=True, type=click.IntRange(1, 3650), help="How long new ones hold.")
+@click.option("--days", default=825, show_default=True, type=click.IntRange(1, 3650), help="Validity of new ones.")
 @common_options
 def certs(folder: Path, hosts: tuple[str, ...], *, days: int, as_json: bool) -> None:
     """Make an authority and certificates for the service and for Dask in the folder DIR.
 
-    Run it again to add a host, or to renew what has expired: the authority stays. serve takes the folder with --certs,
-    and Dask's traffic with --tls.
+    Run it again to add a host, or to renew what has expired: the authority stays. Give the folder to serve with
+    --certs, and for Dask's traffic with --tls.
     """
     from ..cluster.certificates import make_certificates
 

@@ -41,7 +41,7 @@ debug_option = click.option(
     is_flag=True,
     expose_value=False,
     callback=lambda ctx, param, value: ctx.meta.update({DEBUG: value}),
-    help="Show where in the program an error came up.",
+    help="Show where in the program an error occurred.",
 )
 
 
@@ -62,7 +62,7 @@ def show(found: dict[str, Any], *, as_json: bool) -> None:
             click.echo(f"{name if k == 0 else '':<{width}}  {'-' if line is None else line}")
 
 
-overwrite_option = click.option("--overwrite", is_flag=True, help="Begin anew, whatever is there.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what is there.")
 
 
 @contextmanager

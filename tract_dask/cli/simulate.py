@@ -43,14 +43,14 @@ def simulate() -> None:
 @click.option("--contrast", type=float, help="Factor on the contrast. [gaussian: 0.5; multislice: 1].")
 @click.option("--drift-px", default=0.3, show_default=True, metavar="PX", help="Step of the random drift, per axis.")
 @click.option("--jump-pm", default=15.0, show_default=True, metavar="PM", help="How far one column jumps (ceo2).")
-@click.option("--seed", default=0, show_default=True, help="The number that fixes all randomness.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the random numbers.")
 @common_options
 @specimen_options
 @microscope_options
 def simulate_movie(
     output: Path, specimen: SpecimenSettings, microscope: Microscope, *, model: str, as_json: bool, **options: Any
 ) -> None:
-    """Write a drifting, counted movie to OUTPUT (.tif), and its truth beside it (.zarr)."""
+    """Write a drifting, counted movie to OUTPUT (.tif), and its truth next to it (.zarr)."""
     from ..simulate.files import write_simulated_movie
 
     written = write_simulated_movie(output, model, specimen, microscope, **options)
@@ -68,7 +68,7 @@ def simulate_image(
 ) -> None:
     """Write a noise-free image to OUTPUT (.tif), vacuum = 1.
 
-    Its columns (.csv) and its settings (.toml) go beside it.
+    Its columns (.csv) and its settings (.toml) go next to it.
     """
     from ..simulate.files import write_simulated_image
 
@@ -95,9 +95,9 @@ def simulate_table(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Write what intensity a column of 1, 2, 3 ... atoms has to OUTPUT (.csv).
+    """Write the intensities of columns of 1, 2, 3 ... atoms to OUTPUT (.csv).
 
-    The images (.tif, all columns equally thick) and the settings (.toml) go beside it. Give the pixel size and the fit
+    The images (.tif, all columns equally thick) and the settings (.toml) go next to it. Give the pixel size and the fit
     of the experiment: they change intensities.
     """
     from ..simulate.files import write_simulated_table

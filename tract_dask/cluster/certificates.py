@@ -162,7 +162,7 @@ def _authority(folder: Path) -> Certificate:
         return _about(path, found, made=False)
     if any(there):
         raise DestinationError(
-            "only half of an authority is here",
+            "the authority is incomplete",
             str(folder),
             f"{CA} and {CA_KEY}",
             CA if there[0] else CA_KEY,

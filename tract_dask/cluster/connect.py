@@ -221,7 +221,7 @@ def memory_limit(settings: ClusterSettings) -> int | None:
         return int(parse_bytes(settings.memory_limit))
     except ValueError as error:
         raise SettingsError(
-            "the memory limit is no size",
+            "the memory limit is not a size",
             "setting memory_limit (ClusterSettings)",
             "a number with a unit, such as 2GB or 500MiB",
             repr(settings.memory_limit),

@@ -51,7 +51,7 @@ class Death:
         if self.out_of_memory:
             return "it took more memory than its limit, and was ended"
         if self.code is None:
-            return "nobody knows why"
+            return "the cause is unknown"
         if self.code >= 0:
             return f"exit code {self.code}"
         if -self.code == signal.SIGKILL:

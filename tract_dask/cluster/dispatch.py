@@ -165,7 +165,7 @@ class Dispatch:
             raise ClusterError(
                 f"stage {self._name} was left without a worker or a scheduler",
                 "the cluster",
-                remedy="See the workers' logs, start the cluster anew, and run again: what is done is kept",
+                remedy="See the workers' logs, restart the cluster, and run again: what is done is kept",
             ) from error
         except TimeoutError:
             if future.status == "error":

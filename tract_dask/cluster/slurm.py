@@ -177,5 +177,5 @@ def _ask(command: list[str], said: str = "") -> str:
             " ".join(command),
             "a job that can be queued, on a machine on which SLURM's commands work",
             str(getattr(error, "stderr", "") or error).strip(),
-            "Mend what it names in the cluster's settings",
+            "Correct what it names in the cluster's settings",
         ) from error

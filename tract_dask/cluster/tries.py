@@ -148,7 +148,7 @@ def _explained(error: BaseException, number: int, where: str, place: Place) -> T
         "a file cannot be read or written",
         where,
         got=", ".join(filter(None, (os.strerror(number), on))),
-        remedy="Look at the file system of that machine, then run the same command again: what is done is kept",
+        remedy="Check the file system of that machine, then run the same command again: what is done is kept",
     )
 
 

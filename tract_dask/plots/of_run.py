@@ -233,7 +233,7 @@ def draw_figures(
     stages = [run / f"{name}.zarr" for name in ("results", "sum", "columns", "drift", "movie")]
     if missing := [path.name for path in stages if not path.is_dir()]:
         raise StoreError(
-            "this is no finished run", str(run), "the folder of tract-dask run", f"no {missing[0]}", "Run it"
+            "this is not a finished run", str(run), "the folder of tract-dask run", f"no {missing[0]}", "Run it"
         )
     left_out = SLOW + (OF_TABLE if table is None else ())
     chosen = [name for name in FIGURES if name not in left_out] if only is None else list(only)

@@ -139,7 +139,7 @@ def _stored(dataset: Any, where: str) -> np.dtype[Any]:
             where,
             "whole bytes a pixel",
             str(dataset.id.get_type()),
-            "Write the movie again, as a data set of its own",
+            "Write the movie again, as an ordinary data set",
         )
     return stored
 

@@ -247,7 +247,7 @@ def _behind(dataset: Any, access: Access, behind: Behind, depth: int, frames: ra
             "virtual data sets lead in a circle",
             f"{holder}::{dataset.name}",
             f"at most {MOST_LINKS} on top of each other",
-            remedy="Write the movie again, as a data set of its own",
+            remedy="Write the movie again, as an ordinary data set",
         )
     for (name, inner), (extent, span) in _virtual_sources(properties).items():
         for block in count() if "%b" in name + inner else (0,):
@@ -394,7 +394,7 @@ def _missing(holder: Path, inner: str, name: str, what: str) -> SourceError:
     return MissingSourceError(
         what,
         f"{holder}::{inner}",
-        f"{name}, in the folder of {holder.name} where it has no folder of its own",
+        f"{name}, in the folder of {holder.name} where it names no folder",
         "no such file",
         "Copy all files of the movie, and keep their names and folders",
     )

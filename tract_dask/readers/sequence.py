@@ -137,5 +137,5 @@ def gaps(names: list[str]) -> tuple[str, ...]:
     more = f" (and {len(wide) - 1} more)" if len(wide) > 1 else ""
     return (
         f"the sequence has a gap in its numbers: {names[wide[0] + 1]} follows {names[wide[0]]}{more};"
-        " the frames are taken as they are",
+        " the frames are read without one for the gap",
     )

@@ -250,7 +250,7 @@ def checked_shape(shape: tuple[int, ...], where: str) -> tuple[int, int, int]:
         )
     if n_frames > MOST_FRAMES:
         raise SourceError(
-            "the number of frames makes no sense",
+            "the number of frames is impossible",
             where,
             f"at most {MOST_FRAMES:,}",
             f"{n_frames:,}",

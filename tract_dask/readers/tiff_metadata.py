@@ -166,11 +166,11 @@ def _one_axis(path: Path, **lengths: int) -> tuple[str, ...]:
         raise SourceError(
             "the data are not a movie",
             str(path),
-            "one axis of frames beside y and x",
+            "one axis of frames, and y and x",
             ", ".join(
                 f"{n} {name}" if not name.startswith("axis") else f"{name} of {n}" for name, n in lengths.items()
             ),
-            "Save one channel, or one slice over time, as a file of its own",
+            "Save one channel, or one slice over time, as a separate file",
         )
     n_channels = lengths.get("channels", 1)
     return (f"the {n_channels} channels of {path.name} are taken for frames",) if n_channels > 1 else ()

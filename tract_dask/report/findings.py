@@ -204,7 +204,7 @@ def _errors(run: Survey) -> Iterator[Finding]:
         remedy = (
             "Columns move, drift is left over, or the noise is not that of counts (--gain, --no-counting)."
             if more
-            else "The noise is smaller than that of counts: check --gain, or say --no-counting."
+            else "The noise is smaller than that of counts: check --gain, or use --no-counting."
         )
         yield Finding("scatter", "The stated errors do not fit the scatter", text, remedy)
 

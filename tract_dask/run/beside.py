@@ -23,7 +23,7 @@ from ..store.keys import counted
 from ..store.run_folder import COLUMNS, DRIFT, MOVIE, RESULTS, RunFolder
 from .faults import Fault
 
-_AGAIN = "Run the same command again: it writes the file anew"
+_AGAIN = "Run the same command again: it writes the file again"
 _EVENTS_BYTES = 1 << 30
 _END_BYTES = 64
 
@@ -65,12 +65,12 @@ def look_beside(folder: Path, found: Sequence[Path]) -> Beside:
     checks: list[tuple[Path, Callable[[Path], str], str]] = [
         (RunFolder(folder).settings, partial(_settings, about=about), _AGAIN),
         (RunFolder(folder).events, _events, "Remove it: it is a record that nothing needs"),
-        (RunFolder(folder).report, _report, f"tract-dask report {folder} makes it anew"),
+        (RunFolder(folder).report, _report, f"tract-dask report {folder} writes it again"),
     ]
     for store in tables:
         csv, png = store.with_suffix(".csv"), store.with_suffix(".png")
-        anew = f"Mend {csv}, or remove it and run the same command again: then columns are found anew"
-        checks.append((csv, partial(_table, about=about[store]), anew))
+        repair = f"Repair {csv}, or remove it and run the same command again: then columns are found again"
+        checks.append((csv, partial(_table, about=about[store]), repair))
         checks.append((png, _figure, f"Remove {png} and run the same command again"))
     needed = {store.with_suffix(".csv") for store in tables}
     needed |= {RunFolder(folder).settings} if (RunFolder(folder).events).exists() else set()

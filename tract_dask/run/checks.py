@@ -68,7 +68,7 @@ def check_columns(shape: tuple[int, ...], settings: ColumnSettings, window_px: i
         As :func:`check_inputs`.
     """
     if settings.method == "csv":
-        table = _required(settings.csv, "--columns")
+        table = _required(settings.csv, "--columns-csv")
         check_inside(read_columns_csv(table), shape, str(table))
     if settings.method == "lattice":
         lattice_sites(settings.lattices, shape)
@@ -142,7 +142,7 @@ def check_suffix(path: Path, suffix: str) -> None:
     """Check that the name of a file ends as it has to."""
     if path.suffix != suffix:
         raise DestinationError(
-            "the name does not fit", str(path), f"a name that ends in {suffix}", path.name, "Change it"
+            "the file name has the wrong suffix", str(path), f"a name that ends in {suffix}", path.name, "Change it"
         )
 
 
@@ -182,9 +182,7 @@ def check_output(
     root = outputs.root
     ours = outputs.settings.exists() or outputs.events.exists()
     if root.exists() and not root.is_dir():
-        raise DestinationError(
-            "this place holds something else", str(root), "a folder", "a file", "Choose another place"
-        )
+        raise DestinationError("the output is not a folder", str(root), "a folder", "a file", "Choose another place")
     for path in outputs.written():
         if path.suffix != ".zarr" and path.is_dir():
             raise DestinationError(
@@ -193,11 +191,11 @@ def check_output(
     others = sorted(path.name for path in root.glob("[!.]*"))
     if others and not ours and not overwrite:
         raise DestinationError(
-            "this folder holds something else",
+            "the output folder already holds other files",
             str(root),
             "an empty folder, or that of an earlier run",
             ", ".join(others[:3]),
-            "Choose another place, or say --overwrite",
+            "Choose another folder, or use --overwrite",
         )
     if not overwrite:
         _check_movie(outputs, source, settings)
@@ -217,7 +215,7 @@ def _check_movie(outputs: RunFolder, source: FrameSource, settings: RunSettings 
             str(outputs.root),
             f"an empty folder, or a run of what {source.path} holds now",
             f"a run of what {before} held on {present.get('created', 'an unknown day')}",
-            "Choose another place, or say --overwrite: then all of that run is made again",
+            "Choose another folder, or use --overwrite: then all of that run is made again",
         )
     if settings is not None:
         check_kept(outputs.movie, source, settings.convert, settings.source)

@@ -41,7 +41,7 @@ def compare_in_run(
     stage = {name: run / f"{name}.zarr" for name in ("movie", "drift", "columns")}
     if missing := [path.name for path in stage.values() if not path.is_dir()]:
         raise MissingStoreError(
-            "this is no finished run", str(run), "movie.zarr, drift.zarr and columns.zarr", f"no {missing[0]}", "Run it"
+            "the run is not finished", str(run), "movie.zarr, drift.zarr and columns.zarr", f"no {missing[0]}", "Run it"
         )
     movie, drift, columns = open_movie(stage["movie"]), *(datasets.open_dataset(stage[k]) for k in ("drift", "columns"))
     compared = compare_filters(movie, columns, drift, frames=frames, column_ids=column_ids, settings=settings)

@@ -96,7 +96,7 @@ class Session:
                 "a file could not be read or written",
                 error.filename or f"{self._started.output}, made from {self._started.source}",
                 got=os.strerror(error.errno),
-                remedy="Look at the disk, then run the same command again: what is done is kept",
+                remedy="Check the disk, then run the same command again: what is done is kept",
             ) from error
 
     def _on_connect(self, client: Client) -> None:

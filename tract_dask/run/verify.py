@@ -70,7 +70,7 @@ class Verified:
         kinds = (("damaged", "missing"), ("left over",))
         found = [fault.remedy for kind in kinds for fault in self.faults if fault.what in kind]
         unreadable = [fault.file for fault in self.faults if fault.what == "unreadable"]
-        found += [f"Mend the disk or the permissions of {unreadable[0]}"] if unreadable else []
+        found += [f"Repair the disk or the permissions of {unreadable[0]}"] if unreadable else []
         return list(dict.fromkeys(found))
 
     def text(self) -> str:

@@ -62,11 +62,11 @@ def job_settings(values: dict[str, Any]) -> RunSettings:
     """
     if "cluster" in values:
         raise SettingsError(
-            "the cluster is the service's",
+            "a job cannot choose the cluster",
             "settings",
             f"groups {', '.join(name for name in values if name != 'cluster') or 'of the run'}",
             "cluster",
-            "Leave it out; serve --cluster chooses it",
+            "Leave it out; serve --cluster sets it",
         )
     return from_dict(RunSettings, values)
 

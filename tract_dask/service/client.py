@@ -145,7 +145,7 @@ class ServiceClient:
         self.url, self._patience_s = url.rstrip("/"), patience_s
         if not self.url.startswith(("http://", "https://")):
             raise InputError(
-                "this is no address of a service", url, "http://HOST:PORT or https://HOST:PORT", remedy="Correct it"
+                "this is not an address of a service", url, "http://HOST:PORT or https://HOST:PORT", remedy="Correct it"
             )
         self._http = httpx.Client(
             base_url=f"{self.url}{API}",
@@ -349,7 +349,7 @@ class ServiceClient:
         if path.suffix.lower() not in FORMATS:
             raise DestinationError("the format is unknown", str(path), f"a name that ends in {', '.join(FORMATS)}")
         if path.exists() and not overwrite:
-            raise DestinationError("this file is there already", str(path), remedy="Choose another, or say overwrite")
+            raise DestinationError("the file already exists", str(path), remedy="Choose another, or say overwrite")
         params = {"format": FORMATS[path.suffix.lower()]}
         aside = path.with_name(f".{path.name}.part")
         try:
@@ -474,7 +474,7 @@ def parse_events(lines: Iterable[str]) -> Iterator[ServiceEvent]:
 
 def _check_time(deadline: float | None, path: str) -> None:
     if deadline is not None and monotonic() > deadline:
-        raise TimeoutError(f"{path}: this takes longer than was to be waited for")
+        raise TimeoutError(f"{path}: the answer took longer than the timeout")
 
 
 def _temporary_folder() -> Path:

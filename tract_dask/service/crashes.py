@@ -43,14 +43,14 @@ def crashed(file: str, sign: str) -> CrashError:
         file,
         "a file that can be read to its end",
         sign,
-        "It may be damaged, or somebody changed it meanwhile: write it again from its origin",
+        "It may be damaged, or another program changed it meanwhile: write it again from its origin",
     )
 
 
 def unending(file: str, seconds: float) -> CrashError:
     """Return the error for a file that was not read within ``seconds``."""
     return CrashError(
-        "the reader does not come to an end with this file",
+        "the reader did not finish with this file in time",
         file,
         f"an answer within {seconds:g} s",
         "none",

@@ -229,7 +229,7 @@ class ColumnEditor:
         style = "width: 100%; height: min(80vh, 900px); border: 1px solid #8888; border-radius: 6px"
         return (
             f'<iframe src="{self.url}?frame=1" style="{style}" title="Columns"></iframe>'
-            f'<p><a href="{self.url}" target="_blank" rel="noopener">Open the editor in a tab of its own</a></p>'
+            f'<p><a href="{self.url}" target="_blank" rel="noopener">Open the editor in a new tab</a></p>'
         )
 
     def _keep(self, table: str) -> None:

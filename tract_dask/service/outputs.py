@@ -100,7 +100,7 @@ def checked_place(root: DataRoot, mark: Mark) -> Path:
             'names that do not begin with ".", nor end with " " or ".", nor have signs that cannot be seen',
         )
     if folded(output) in ((), folded(JOBS)):
-        raise _refused("the data root is no folder for a job", output or "output", "a folder in it")
+        raise _refused("a job cannot write to the data root itself", output or "output", "a folder in it")
     if twin := _twin(root.path, PurePosixPath(output).parts):
         raise _refused("this name differs from one that is there only as letters may", output, twin)
     return place
@@ -120,18 +120,20 @@ def check_owner(root: DataRoot, mark: Mark) -> None:
     for around in place.relative_to(root.path).parents:
         if around.parts and _holds_run(root.path / around):
             raise _refused(
-                "this folder lies in the output of another run", mark.output, "a folder of its own", str(around)
+                "this folder lies in the output of another run", mark.output, "a folder outside of it", str(around)
             )
     if not os.path.lexists(place):
         return
     if not place.is_dir():
-        raise _refused("this place holds something else", mark.output, "a folder", "a file")
+        raise _refused("the output is not a folder", mark.output, "a folder", "a file")
     found = read_mark(place)
     if found is None and mark.named_by_id:  # of a version that left no marks
         return
     if found is None or found.output != mark.output:
         raise _refused(
-            "this folder holds something else", mark.output, "a new folder, or one that a job of yours has made"
+            "the output folder already holds other files",
+            mark.output,
+            "a new folder, or one that a job of yours has made",
         )
     if found.owner != mark.owner:
         raise ForbiddenError(
@@ -161,7 +163,7 @@ def claim(root: DataRoot, mark: Mark, patience_s: float = 0.0) -> None:
             if place.is_dir() and (mark.named_by_id or read_mark(place) is not None):
                 write_mark(place, mark)
                 return
-    raise _refused("this folder comes and goes", mark.output, "a folder that nobody else uses")
+    raise _refused("another program keeps removing this folder", mark.output, "a folder that no other program uses")
 
 
 def seal(root: DataRoot, mark: Mark) -> None:

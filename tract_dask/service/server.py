@@ -237,7 +237,7 @@ def check_traffic(config: ServiceConfig) -> list[str]:
         return []
     if config.needs_tokens:
         raise InputError(
-            "tokens would keep nobody out: everyone who reaches this cluster can run code on it",
+            "tokens would not protect the service: everyone who reaches this cluster can run code on it",
             f"cluster of kind {cluster.resolved_kind}",
             "a cluster with TLS",
             "one without",
@@ -246,7 +246,7 @@ def check_traffic(config: ServiceConfig) -> list[str]:
     if host_name(urlsplit(cluster.scheduler or "").netloc) in LOOPBACK:
         return []
     return [
-        "Dask's traffic is not encrypted, and whoever reaches the scheduler can run code on it: "
+        "Dask's traffic is not encrypted, and everyone who reaches the scheduler can run code on it: "
         "make certificates with tract-dask certs, and give them with --tls."
     ]
 

@@ -61,17 +61,18 @@ class ClusterSettings(Settings):
 
     kind: str | None = setting(
         None,
-        "What starts the workers: this machine, somebody else, SLURM or ssh; unset: local, or address if one is given",
+        "Where workers run: this machine, a running cluster, SLURM or ssh; unset: local, or address if one is given",
         choices=("local", "address", "slurm", "ssh"),
         in_files_only=True,
     )
-    scheduler: str | None = setting(None, "Address of a running Dask scheduler")
+    scheduler: str | None = setting(None, "Address of a running Dask scheduler", common=True)
     scheduler_file: str | None = setting(None, "Scheduler file of a running Dask scheduler")
     workers: int | None = setting(
         None,
         "Worker processes: of the local cluster or of each ssh host (unset: one a core), or of all SLURM jobs",
         low=1,
         high=4096,
+        common=True,
     )
     min_workers: int | None = setting(
         None,
@@ -81,7 +82,7 @@ class ClusterSettings(Settings):
         in_files_only=True,
     )
     memory_limit: str | None = setting(
-        None, "Memory of each worker that we start, such as 2GB; unset: its share of the machine"
+        None, "Memory of each worker that we start, such as 2GB; unset: its share of the machine", common=True
     )
     threads: int = setting(
         1, "Threads of each worker that we start: tasks that share its memory", low=1, high=256, in_files_only=True
@@ -131,7 +132,7 @@ class ClusterSettings(Settings):
         }
         what, found = needed.get(self.resolved_kind, ("", True))
         if not found:
-            raise contradiction("kind", what, f"kind = {self.kind!r} without", "Say them")
+            raise contradiction("kind", what, f"kind = {self.kind!r} without", "Set them")
         if named and self.resolved_kind != "address":
             raise contradiction(
                 named[0], "kind = 'address', or none", f"kind = {self.kind!r}", "Leave the scheduler or the kind out"

@@ -33,15 +33,17 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
-    flag: str = "",
+    grouped: bool = False,
+    common: bool = False,
     pattern: str = "",
     form: str = "",
     in_files_only: bool = False,
 ) -> Any:
     """Declare a setting: a dataclass field that carries its documentation and its range.
 
-    ``flag`` names its option on the command line where that is not simply the field's name with dashes; a setting that
-    is ``in_files_only`` has none. Text, or each text of a list, has to match ``pattern``, which ``form`` puts in words.
+    Its option on the command line has its name, after the name of its group where it is ``grouped``; ``--help`` lists
+    the ``common`` ones. A setting that is ``in_files_only`` has no option. Text, or each text of a list, has to match
+    ``pattern``, which ``form`` puts in words.
     """
     return field(
         default=default,
@@ -51,12 +53,19 @@ def setting(
             "low": low,
             "high": high,
             "choices": choices,
-            "flag": flag,
+            "grouped": grouped,
+            "common": common,
             "pattern": pattern,
             "form": form,
             "in_files_only": in_files_only,
         },
     )
+
+
+def option(group: str, item: dataclasses.Field[Any]) -> str:
+    """Return the option of a setting on the command line, such as ``--drift-csv``."""
+    name = f"{group}_{item.name}" if item.metadata["grouped"] else item.name
+    return "--" + name.replace("_", "-")
 
 
 def subgroup(description: str) -> dict[str, Any]:
@@ -106,7 +115,11 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
     kind = plain_type(annotation)
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise SettingsError(
-            "the value is of the wrong type", where, kind.__name__, shown(value), meta.get("description", "")
+            "the value is of the wrong type",
+            where,
+            "list" if kind is tuple else kind.__name__,
+            shown(value),
+            meta.get("description", ""),
         )
     if isinstance(value, tuple):
         _check_items(where, meta, annotation, value)
@@ -148,14 +161,14 @@ def _check_items(where: str, meta: Mapping[str, Any], annotation: Any, value: tu
     listed = next((arg for arg in typing.get_args(annotation) if typing.get_origin(arg) is tuple), annotation)
     if int in typing.get_args(listed) and not all(type(item) is int and abs(item) < 2**63 for item in value):
         raise SettingsError(
-            "the list holds something else", where, "whole numbers", shown(list(value)), meta["description"]
+            "the list holds other values", where, "whole numbers", shown(list(value)), meta["description"]
         )
 
 
 def _check_text(where: str, meta: Mapping[str, Any], texts: Iterable[Any]) -> None:
     for text in texts:
         if not isinstance(text, str) or not re.fullmatch(meta["pattern"], text):
-            raise SettingsError("the text has another form", where, meta["form"], shown(text), meta["description"])
+            raise SettingsError("the text has the wrong form", where, meta["form"], shown(text), meta["description"])
 
 
 def contradiction(name: str, expected: str, got: str, remedy: str) -> SettingsError:

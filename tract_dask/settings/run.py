@@ -16,7 +16,7 @@ from .declare import Settings, setting
 
 @dataclass(frozen=True)
 class SourceSettings(Settings):
-    """How to read a file that does not say enough about itself."""
+    """How to read a raw file, which does not describe itself."""
 
     raw_shape: tuple[int, ...] | None = setting(
         None,
@@ -29,12 +29,16 @@ class SourceSettings(Settings):
 
 @dataclass(frozen=True)
 class MetadataSettings(Settings):
-    """What the user knows better than the file; unset means as the file says."""
+    """Values that replace those of the file; unset: the file's."""
 
-    pixel_size_pm: float | None = setting(None, "Size of a pixel", unit="pm", low=1e-3, high=1e7)
-    frame_time_s: float | None = setting(None, "Time from one frame to the next", unit="s", low=1e-12, high=1e6)
-    dose: float | None = setting(None, "Electron dose of one frame", unit="e/A^2", low=0)
-    gain: float = setting(1.0, "Electron counts for one detector unit", unit="counts", low=1e-12, high=1e12)
+    pixel_size_pm: float | None = setting(None, "Size of a pixel", unit="pm", low=1e-3, high=1e7, common=True)
+    frame_time_s: float | None = setting(
+        None, "Time from one frame to the next", unit="s", low=1e-12, high=1e6, common=True
+    )
+    dose: float | None = setting(None, "Electron dose of one frame", unit="e/A^2", low=0, common=True)
+    gain: float = setting(
+        1.0, "Electron counts for one detector unit", unit="counts", low=1e-12, high=1e12, common=True
+    )
 
 
 @dataclass(frozen=True)
@@ -56,17 +60,18 @@ class DriftSettings(Settings):
         "auto",
         "Measure the drift, read it from a CSV file, or take it as zero",
         choices=("auto", "csv", "none"),
-        flag="--drift",
+        grouped=True,
+        common=True,
     )
     csv: str | None = setting(
-        None, "CSV file with columns frame, y, x (drift in px), for method csv", flag="--drift-csv"
+        None, "CSV file with columns frame, y, x (drift in px), for method csv", grouped=True, common=True
     )
     search_px: float | None = setting(
         None,
         "Largest step between two frames; unset: 0.4 of the shortest lattice period",
         unit="px",
         low=0.5,
-        flag="--drift-search-px",
+        grouped=True,
     )
 
 
@@ -76,19 +81,25 @@ class ColumnSettings(Settings):
 
     method: str = setting(
         "auto",
-        "Find columns automatically, on lattices, at the positions of a CSV file, or by what stands out of the noise",
+        "auto: on the image's lattice; lattice: on lattices; csv: a table; maxima, blobs, template: peak detectors",
         choices=("auto", "lattice", "csv", "maxima", "blobs", "template"),
-        flag="--columns-method",
+        grouped=True,
+        common=True,
     )
-    csv: str | None = setting(None, "CSV file with columns x, y and optionally column_id, kind", flag="--columns")
+    csv: str | None = setting(
+        None, "CSV file with columns x, y and optionally column_id, kind", grouped=True, common=True
+    )
     contrast: str = setting(
-        "bright", "Columns are brighter or darker than their surroundings", choices=("bright", "dark")
+        "bright", "Columns are brighter or darker than their surroundings", choices=("bright", "dark"), common=True
     )
     lattices: tuple[Any, ...] = setting(
         (),
         "Lattices for method lattice: origin, a, a_count, b, b_count (positions in px), a_repeats, b_repeats, kind",
+        common=True,
     )
-    spacing_px: float | None = setting(None, "Distance between neighbouring columns; unset: measured", unit="px", low=2)
+    spacing_px: float | None = setting(
+        None, "Distance between neighbouring columns; unset: measured", unit="px", low=2, common=True
+    )
     search_radius_px: float | None = setting(
         None, "Radius of the local maximum around a seed; unset: a quarter of the spacing", unit="px", low=0
     )
@@ -96,20 +107,15 @@ class ColumnSettings(Settings):
         None, "Radius of the centroid around that maximum; unset: an eighth of the spacing", unit="px", low=1
     )
     min_amplitude: float = setting(
-        0.15,
-        "Weakest column that is kept, against the median amplitude",
-        low=0,
-        high=1,
-        flag="--min-amplitude",
+        0.15, "Weakest column that is kept, against the median amplitude", low=0, high=1, common=True
     )
     detection_threshold: float = setting(
-        5.0, "Methods maxima, blobs, template: weakest column, in units of what noise alone shows", low=0, high=1e4
+        5.0, "Methods maxima, blobs, template: weakest column, in units of the peaks of noise alone", low=0, high=1e4
     )
     template: tuple[int, ...] | None = setting(
         None,
-        "Method template: x, y of the column that the others look like; unset: the mean of the strongest",
+        "Method template: x, y of an example column; unset: the mean of the strongest",
         unit="px",
-        flag="--template-at",
     )
 
 
@@ -118,33 +124,42 @@ class FitSettings(Settings):
     """How a column is fitted in every frame."""
 
     window_px: int | None = setting(
-        None, "Diameter of the round window that is fitted, odd; unset: half the spacing", unit="px", low=5, high=501
+        None,
+        "Diameter of the round window that is fitted, odd; unset: half the spacing",
+        unit="px",
+        low=5,
+        high=501,
+        common=True,
     )
     estimator: str = setting(
         "lsq",
         "Least squares on blurred pixels, or maximum likelihood on raw counts (poisson), best where contrast is high",
         choices=("lsq", "poisson"),
+        common=True,
     )
     shape: str = setting(
         "fixed",
         "Sigmas and theta of a column stay as in the summed image, or are fitted in every frame (free, the paper's)",
         choices=("fixed", "free"),
+        common=True,
     )
     filter: str = setting(
         "gaussian",
-        "What frames go through before lsq fits: a Gaussian blur, a filter of the whole frame, or nothing",
+        "Filter before lsq fits: a Gaussian blur, a filter of the whole frame (wiener, tv-l1), or none",
         choices=("gaussian", "wiener", "tv-l1", "none"),
+        common=True,
     )
     blur_sigma_px: float = setting(
         2.0,
-        "Gaussian blur (the paper's 2 px) before columns, noise and lsq fits are looked at; 0 leaves pixels raw",
+        "Sigma of the Gaussian blur before columns, noise and lsq fits (the paper's 2 px); 0: no blur",
         unit="px",
         low=0,
         high=20,
+        common=True,
     )
     wiener_background: float = setting(
         1.0,
-        "Filter wiener: times that the radial background of the power spectrum is subtracted",
+        "Filter wiener: factor of the radial background that is subtracted from the power spectrum",
         low=0,
         high=100,
     )
@@ -181,10 +196,14 @@ class FitSettings(Settings):
         5.0, "Amplitude stays below this factor of that in the summed image", low=1.01, high=1e6
     )
     threshold: float = setting(
-        1.6, "Accept a fit where the amplitude exceeds this times the noise (the paper's 2)", low=0, high=100
+        1.6,
+        "Accept a fit where the amplitude exceeds this times the noise (the paper's 2)",
+        low=0,
+        high=100,
+        common=True,
     )
     counting: bool = setting(
-        True, "For standard errors: the noise grows with the signal, as counts do; else it is the same in every pixel"
+        True, "For standard errors: noise that grows with the signal, as in counts; off: the same noise in every pixel"
     )
     intensity_scale: str = setting(
         "paper",

@@ -12,7 +12,7 @@ import tomli_w
 
 from ..errors import SettingsError, shown
 from .cluster import ClusterSettings
-from .declare import Settings, T
+from .declare import Settings, T, is_optional, plain_type
 from .run import RunSettings
 
 
@@ -30,6 +30,7 @@ def to_toml(settings: Settings) -> str:
 
     Examples
     --------
+    >>> from tract_dask.settings import FitSettings
     >>> from_toml(FitSettings, to_toml(FitSettings(window_px=31))).window_px
     31
     """
@@ -48,7 +49,7 @@ def from_toml(kind: type[T], text: str, where: str = "settings") -> T:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(
-            "this is not valid TOML", where, got=str(error), remedy="Mend the line that it names"
+            "this is not valid TOML", where, got=str(error), remedy="Correct the line that it names"
         ) from error
     return from_dict(kind, values, where)
 
@@ -74,6 +75,54 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "settings") ->
             )
         arguments[name] = from_dict(kinds[name], value, f"{where} [{name}]") if nested else value
     return kind(**arguments)
+
+
+def assigned(text: str) -> tuple[tuple[str, ...], Any]:
+    """Return the path and the value of a run's setting that is written as ``group.name=value``; None where it is unset.
+
+    Text needs no quotes, and a list no brackets.
+
+    Raises
+    ------
+    SettingsError
+        Where there is no such setting, or no value.
+
+    Examples
+    --------
+    >>> assigned("fit.vacuum_box=0,64,0,64")
+    (('fit', 'vacuum_box'), [0, 64, 0, 64])
+    """
+    name, equals, said = text.partition("=")
+    path = tuple(name.strip().split("."))
+    kind: Any = RunSettings
+    for part in path:
+        kinds = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
+        if part not in kinds:
+            expected = f"one of {', '.join(kinds)}" if kinds else f"{name.rpartition('.')[0]} without a further name"
+            remedy = "Correct its name; docs/settings.md lists them all"
+            raise SettingsError(f"there is no setting {part!r}", f"--set {text}", expected, name, remedy)
+        kind = kinds[part]
+    if not equals or dataclasses.is_dataclass(kind):
+        remedy = "Write it as group.name=value, such as fit.window_px=31"
+        raise SettingsError("a setting and its value are needed", f"--set {text}", "group.name=value", text, remedy)
+    said = said.strip()
+    unset = said == "unset" and (is_optional(kind) or plain_type(kind) is tuple)
+    return path, None if unset else value(said, kind)
+
+
+def value(text: str, annotation: Any) -> Any:
+    """Return the value of a setting from what a command line says; text that is no such value comes back unchanged."""
+    kind = plain_type(annotation)
+    try:
+        if kind in (int, float, str):
+            return kind(text)
+        if kind is tuple and not text.startswith("["):
+            if str in typing.get_args(annotation):
+                return text.split(",")
+            text = f"[{text}]"
+        return tomllib.loads(f"value = {text}")["value"]
+    except ValueError:
+        return text
 
 
 def load(path: Path) -> RunSettings:

@@ -68,7 +68,7 @@ def write_simulated_movie(
             "setting structure",
             "ceo2",
             specimen.structure,
-            "Say --model multislice",
+            "Use --model multislice",
         )
     beside = path.with_suffix(".zarr")
     write_dataset(truth, beside)
@@ -213,5 +213,5 @@ def _write_all(contents: dict[Path, bytes]) -> list[Path]:
 def _check_suffix(path: Path, *suffixes: str) -> None:
     if path.suffix not in suffixes:
         raise DestinationError(
-            "the name does not say what is to be written", str(path), f"a name that ends in {suffixes[0]}", path.name
+            "the file name has the wrong suffix", str(path), f"a name that ends in {suffixes[0]}", path.name
         )

@@ -253,6 +253,4 @@ def _write_tiff(
 
 def _check(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
-        raise SettingsError(
-            "a simulated movie cannot be made so", f"simulate_movie: {name}", f"{low:g} to {high:g}", f"{value:g}"
-        )
+        raise SettingsError("a value is out of range", f"simulate_movie: {name}", f"{low:g} to {high:g}", f"{value:g}")

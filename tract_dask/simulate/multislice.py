@@ -154,7 +154,7 @@ def pictures(
     require_simulators()
     if not 0.5 <= pixel_size_pm <= 100.0:
         raise SettingsError(
-            "an image cannot be simulated so", "multislice: pixel_size_pm", "0.5 to 100", f"{pixel_size_pm:g}"
+            "the size of a pixel is out of range", "multislice: pixel_size_pm", "0.5 to 100", f"{pixel_size_pm:g}"
         )
     stride = math.ceil(pixel_size_pm / FINEST_SAMPLING_PM)
     fine = pixel_size_pm / stride

@@ -53,7 +53,7 @@ class SpecimenSettings(Settings):
     width_pm: float = setting(2000.0, "Width of the step's field, or of a block", unit="pm", low=1, high=1e5)
     n_periods: int = setting(6, "Thickness of a block, in periods along the beam", low=1, high=1000)
     zone_axis: tuple[int, ...] = setting(
-        (), "Lattice direction [uvw] along the beam, to cut a block from a file's crystal; unset: the file as it is"
+        (), "Lattice direction [uvw] along the beam, to cut a block from a file's crystal; unset: the unchanged file"
     )
     up: tuple[int, ...] = setting((), "Lattice direction [uvw] upwards in the image; unset: any")
 

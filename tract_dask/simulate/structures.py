@@ -162,7 +162,9 @@ def block(
         raise SettingsError("a block needs a size", "block", "above 0 pm", f"{height_pm:g} x {width_pm:g} pm")
     cell = np.asarray(crystal.cell)
     if abs(np.linalg.det(cell)) < 1e-6:
-        raise InputError("the structure has no unit cell", "block", "three cell vectors", remedy="Use it as it is")
+        raise InputError(
+            "the structure has no unit cell", "block", "three cell vectors", remedy="Use it without zone axis"
+        )
     for name, direction in (("zone_axis", zone_axis), ("up", up)):
         if len(direction) != 3:
             raise SettingsError("a direction has three indices", f"block: {name}", "such as 1,1,0", f"{direction}")

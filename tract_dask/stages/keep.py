@@ -65,7 +65,7 @@ def _made(make: Callable[[], xr.Dataset], on_event: Sink) -> xr.Dataset:
         try:
             return make()
         except DamagedArrayError as error:
-            on_event(Warned(f"{error.where} was damaged on disk: it is made anew"))
+            on_event(Warned(f"{error.where} was damaged on disk: it is made again"))
     return make()
 
 

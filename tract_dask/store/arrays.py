@@ -84,7 +84,7 @@ def load_saved(path: Path) -> NDArray[Any]:
             str(path),
             "an array with its checksum",
             str(error),
-            "Run the same command again: it is made anew",
+            "Run the same command again: it is made again",
         ) from error
     head = io.BytesIO(data[:_HEAD_BYTES])
     np.lib.format.read_magic(head)

@@ -195,7 +195,7 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
                 f"{where}, line {row.line}",
                 "each column_id once",
                 f"{column}, as in line {first[column]}",
-                "Number the columns anew, or leave column_id out",
+                "Renumber the columns, or leave column_id out",
             )
         first[column] = row.line
     fit = np.full((len(numbers), len(parameters.PARAMETERS)), np.nan)

@@ -44,7 +44,7 @@ def unreadable(file: Path, error: OSError) -> StoreError:
     frames = frames_in(file)
     what = f"frames {frames[0]} to {frames[1] - 1} cannot be read" if frames else "it cannot be read"
     got = os.strerror(error.errno) if error.errno else str(error)
-    return StoreError(what, str(file), got=got, remedy="Mend the disk or the permissions, then run again")
+    return StoreError(what, str(file), got=got, remedy="Repair the disk or the permissions, then run again")
 
 
 @contextmanager
@@ -106,16 +106,16 @@ def remedy(file: Path) -> str:
     """Return what makes a damaged store whole again, as a sentence without its full stop."""
     store, again = store_of(file), "run the command that wrote it again"
     if any(folder.name.endswith(".zarr.journal") for folder in file.parents):
-        return "Run the same command again: it makes anew what is damaged"
+        return "Run the same command again: it makes again what is damaged"
     if file.name != METADATA and (store / "frame_bad_pixels").exists():  # a movie
-        return f"tract-dask verify {store} --repair makes it anew from the source of the movie"
+        return f"tract-dask verify {store} --repair makes it again from the source of the movie"
     if (store / "status_ref").exists() and not (store / "fit").exists():
         table = store.with_suffix(".csv")
         return (
-            f"Remove {store}, move {table.name} beside it elsewhere, and {again}; give the table with --columns if you "
-            "have edited it"
+            f"Remove {store}, move {table.name} from there, and {again}; if you have edited the table, give it with "
+            "--columns-csv"
         )
-    return f"Remove {store} and {again}: nothing else is made anew"
+    return f"Remove {store} and {again}: nothing else is made again"
 
 
 class _MissingError(ValueError):

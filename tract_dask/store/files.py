@@ -76,7 +76,7 @@ def disk_errors(path: Path) -> Iterator[None]:
             "writing failed",
             str(path),
             got=os.strerror(error.errno),
-            remedy="Free some space or mend the permissions, then run again: what is done is kept",
+            remedy="Free some space or correct the permissions, then run again: what is done is kept",
         ) from error
 
 

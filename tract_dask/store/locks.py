@@ -334,11 +334,11 @@ def _held(lock: Path, what: str) -> DestinationError:
 
 def _no_lock(lock: Path, error: OSError) -> DestinationError:
     return DestinationError(
-        "this folder cannot be held against other processes",
+        "this folder cannot be locked",
         str(lock.parent),
         "a folder that you may write to",
         error.strerror or str(error),
-        "Mend its permissions or free some space, or choose another place",
+        "Correct its permissions or free some space, or choose another place",
     )
 
 

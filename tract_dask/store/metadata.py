@@ -55,7 +55,7 @@ def attributes(path: Path) -> dict[str, Any]:
             str(path),
             f"format {FORMAT} or older",
             f"format {number}, of version {version}",
-            "Install that version or a newer one, or remove the store and make it anew",
+            "Install that version or a newer one, or remove the store and make it again",
         )
     return found
 
@@ -220,11 +220,11 @@ def check_place(path: Path) -> None:
     """
     if path.exists() and not attributes(path) and not (path.is_dir() and not any(path.iterdir())):
         raise DestinationError(
-            "this place holds something else",
+            "the output already holds other data",
             str(path),
             "nothing, or a store of tract_dask",
             "a folder" if path.is_dir() else "a file",
-            "Choose another place, or say --overwrite",
+            "Choose another place, or use --overwrite",
         )
 
 
@@ -259,7 +259,7 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
             f"a link to {folder.readlink()}, which is not there"
             if folder.is_symlink() and not folder.exists()
             else error.strerror or str(error),
-            "Choose another place, or mend its permissions",
+            "Choose another place, or correct its permissions",
         ) from error
 
 

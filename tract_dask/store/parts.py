@@ -35,7 +35,7 @@ _TAIL_BYTES = 8 * (1 + len(SHARDED)) + CHECKSUM_BYTES
 
 _ABSENT = 2**64 - 1
 
-AGAIN = "Run the same command again: they are made anew"
+AGAIN = "Run the same command again: they are made again"
 
 
 class DamagedPartError(StoreError):

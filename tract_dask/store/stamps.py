@@ -115,9 +115,9 @@ def _time(ns: int) -> str:
 def changed(where: str, expected: str, got: str) -> ChangedSourceError:
     """Return the error for files that are not what they were."""
     return ChangedSourceError(
-        "the movie is not what it was when the conversion began",
+        "the movie has changed since the conversion began",
         where,
         expected,
         got,
-        "Leave it alone until it is converted, and run the same command again: the conversion begins anew",
+        "Do not change it until it is converted, and run the same command again: the conversion starts again",
     )

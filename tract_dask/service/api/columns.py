@@ -115,7 +115,7 @@ class Versions(BaseModel):
 
     versions: list[VersionRecord]
     next_column_id: int = Field(description="No version has a column of this number, or of a higher one.")
-    chosen: int | None = Field(description="The version that is, or was, fitted; null: nobody has chosen one.")
+    chosen: int | None = Field(description="The version that is, or was, fitted; null: none chosen yet.")
     state: State = Field(description="Of the job.")
     may_save: bool = Field(description="Whether you may save a version.")
     may_continue: bool = Field(description="Whether you may let the job go on with a version.")

@@ -38,7 +38,7 @@ class Health(BaseModel):
     )
 
     status: Literal["ok", "degraded", "failed"] = Field(
-        description="degraded: jobs wait for the cluster, which comes again by itself; failed: somebody has to help."
+        description="degraded: jobs wait for the cluster, which restarts by itself; failed: an administrator must act."
     )
     version: str = Field(description="Of tract_dask.")
     database: str = Field(description='"ok", or what is wrong with the job store.')

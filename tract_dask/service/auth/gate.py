@@ -80,7 +80,7 @@ class Gate:
         host, origin, site = (headers.get(name, "") for name in ("host", "origin", "sec-fetch-site"))
         if not self.access.demanded and not self._is_ours(host):
             raise ForbiddenError(
-                "the service is not known by this name",
+                "the service does not answer to this name",
                 "header Host",
                 f"{self.config.host}:{self.config.port}",
                 host,

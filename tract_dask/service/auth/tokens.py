@@ -243,7 +243,7 @@ def identity(request: HTTPConnection) -> Identity:
     """
     found = request.scope.get(IDENTITY)
     if not isinstance(found, Identity):
-        raise NoTokenError("nobody is known to ask", request.url.path)
+        raise NoTokenError("the request has no valid token", request.url.path)
     return found
 
 

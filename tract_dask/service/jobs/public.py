@@ -205,6 +205,6 @@ class JobRecord(BaseModel):
     progress: ProgressRecord
     outcome: OutcomeRecord
     columns_version: int | None = Field(
-        description="Version of the columns that is fitted; 0: those found automatically; null: nobody has chosen."
+        description="Version of the columns that is fitted; 0: those found automatically; null: none chosen yet."
     )
     not_before: str | None = Field(None, description="When a job whose cluster was lost is tried again.")

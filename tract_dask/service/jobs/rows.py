@@ -58,7 +58,7 @@ def change_state(db: sqlite3.Connection, job_id: str, state: State, reason: str,
             f"job {job_id}",
             f"one of {', '.join(sorted(TRANSITIONS[job.state]))}",
             state,
-            "Look at its state, and ask for something else",
+            "Check its state",
         )
     if job.state in ENDED:
         require_sole_output(db, job.output)

@@ -145,7 +145,7 @@ def check_place(path: Path) -> None:
         raise JobStoreError(
             "the job store is gone, and its log is still there",
             str(path),
-            f"a database beside {log.name}",
+            f"a database next to {log.name}",
             "none",
             f"Restore it from a backup; or move {log.name} aside, to begin without jobs and tokens",
         )
@@ -161,7 +161,7 @@ def store_error(path: Path, error: sqlite3.Error) -> JobStoreError:
 
 
 _LOOK = "Check the disk, its free space and the file's permissions"
-_BEGIN_ANEW = "Restore it from a backup; or move it and the files beside it aside, to begin without jobs and tokens"
+_BEGIN_ANEW = "Restore it from a backup; or move it and the files next to it away, to begin without jobs and tokens"
 _WAIT = "Stop the program that has it (fuser shows which one it is), and try again"
 _MEANINGS = {
     "SQLITE_NOTADB": ("the job store is not a database", _BEGIN_ANEW),
@@ -170,7 +170,7 @@ _MEANINGS = {
     "SQLITE_LOCKED": ("the job store is locked by another program", _WAIT),
     "SQLITE_PROTOCOL": ("the job store cannot be locked", "Put it on a local disk"),
     "SQLITE_FULL": ("the disk of the job store is full", "Free some space"),
-    "SQLITE_READONLY": ("the job store cannot be written", "Mend its permissions and those of its folder"),
+    "SQLITE_READONLY": ("the job store cannot be written", "Correct its permissions and those of its folder"),
 }
 
 

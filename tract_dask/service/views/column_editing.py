@@ -234,7 +234,7 @@ def edited_columns(
     xy = np.asarray(places, dtype=np.float64).reshape(-1, 2)
     if not 1 <= len(xy) <= MOST_COLUMNS:
         raise SettingsError(
-            "this is no table of columns",
+            "this is not a table of columns",
             where,
             f"1 to {MOST_COLUMNS} columns",
             str(len(xy)),
@@ -242,7 +242,7 @@ def edited_columns(
         )
     if not np.isfinite(xy).all():
         first = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
-        raise SettingsError("a position is no number", f"{where}, column {first + 1}", "finite x and y in px")
+        raise SettingsError("a position is not a number", f"{where}, column {first + 1}", "finite x and y in px")
     for number, kind in enumerate(kinds, start=1):
         if len(kind) > LONGEST_KIND or kind != kind.strip() or not kind.isprintable():
             expected = f"at most {LONGEST_KIND} printable characters, without spaces around them"

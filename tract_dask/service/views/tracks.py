@@ -244,7 +244,10 @@ def _range(frames: tuple[int, int | None], n_frames: int) -> tuple[int, int]:
     start, stop = frames[0], n_frames if frames[1] is None else min(frames[1], n_frames)
     if not 0 <= start < stop:
         raise InputError(
-            "these are no frames", "start, stop", f"0 <= start < stop <= {n_frames}", f"{start}, {frames[1]}"
+            "start and stop are not a valid range of frames",
+            "start, stop",
+            f"0 <= start < stop <= {n_frames}",
+            f"{start}, {frames[1]}",
         )
     return start, stop
 

@@ -168,7 +168,7 @@ def _template(image: Reals, valid: Mask, maxima: Detector, at: tuple[int, ...] |
     exposed = binned(valid, maxima.step) == 1
     half = default_window(maxima.spacing_px / maxima.step) // 2
     if at is not None and len(at) != 2:
-        raise SettingsError("this is no place", "setting template (ColumnSettings)", "x, y in px", str(at))
+        raise SettingsError("template needs x,y in px", "setting template (ColumnSettings)", "two numbers", str(at))
     places = maxima(image, valid)[0] if at is None else np.array([at], np.float64)
     corner = np.rint((places + 0.5) / maxima.step - 0.5).astype(np.int64) - half
     size = 2 * half + 1

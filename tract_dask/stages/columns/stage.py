@@ -105,7 +105,7 @@ def check_edited(csv: Path, settings: ColumnSettings, shape: tuple[int, ...]) ->
             str(csv),
             "a file, or nothing",
             f"a link to {csv.readlink()}, which is not there" if csv.is_symlink() else "no file",
-            "Bring it back, or move what is there away: then columns are found anew",
+            "Bring it back, or move what is there away: then columns are found again",
         )
     if _Table.read(csv, settings).is_edited:
         check_inside(read_columns_csv(csv), shape, str(csv))
@@ -169,7 +169,7 @@ class _Table:
                 str(self.csv),
                 "nothing, or a table of an earlier run",
                 "another file",
-                "Choose another place, say --overwrite, or give the table as --columns",
+                "Choose another place, use --overwrite, or give the table with --columns-csv",
             )
 
     @property

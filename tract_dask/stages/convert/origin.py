@@ -123,7 +123,7 @@ def check_kept(path: Path, source: FrameSource, settings: ConvertSettings, sourc
             str(path),
             f"nothing, or a movie made from what {source.path} holds now",
             f"a store made from {present.get('source') or 'an unknown source'}",
-            "Choose another place, or say --overwrite",
+            "Choose another place, or use --overwrite",
         )
     if found := _differences(present, source, settings, source_settings):
         frames, *sides = present["shape"]
@@ -132,7 +132,7 @@ def check_kept(path: Path, source: FrameSource, settings: ConvertSettings, sourc
             str(path),
             "the settings and the version that made it",
             "; ".join(found),
-            "Use those, choose another place, or say --overwrite: then its"
+            "Use those, choose another place, or use --overwrite: then its"
             f" {frames} frames of {sides[0]} x {sides[1]} px are converted again from {source.path},"
             " and drift, sum and tracks are made again",
         )
@@ -150,7 +150,7 @@ def _differences(
     then = made.get("settings", {})
     layout = plan_layout(source.shape, source.dtype, settings)
     laid = [layout.frames_per_shard, list(layout.chunk)] == [present.get("frames_per_shard"), present.get("chunk")]
-    found = [] if made.get("content") == origin_of(source).content else ["the source holds something else"]
+    found = [] if made.get("content") == origin_of(source).content else ["the source has other content"]
     if made.get("algorithm") != ALGORITHMS[STAGE]:
         found.append(f"its conversion's number was {made.get('algorithm')}, and is {ALGORITHMS[STAGE]}")
     for name in sorted({*then, *now} - {*(_LAID_OUT if laid else ())}):

@@ -65,7 +65,7 @@ def convert_shard(job: Job, shard: Shard) -> Payload:
     found, expected = (f"shape {it.shape}, {it.dtype}" for it in (source, job.layout))
     if found != expected:
         raise SourceError(
-            "the movie is not what it was when the conversion began",
+            "the movie has changed since the conversion began",
             source.path,
             expected,
             found,

@@ -218,7 +218,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
             on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
         finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
-    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made anew"))
+    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
 
 
 def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
@@ -236,14 +236,16 @@ def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
     if present.get("kind") != "movie" or present.get("key") != key or present.get("complete") or not ours:
         return False
     if stamps.total_bytes > WHOLE_BYTES and present.get("written") != stamps.written:
-        on_event(Warned("the movie was written again since its conversion was interrupted, which begins anew"))
+        on_event(
+            Warned("the movie was written again since its conversion was interrupted: the conversion starts again")
+        )
         return False
     try:
         check_nodes(path, present, AXES)
     except StoreError as error:
         if is_of_system(error):
             raise
-        on_event(Warned(f"{error.where} is damaged: the conversion, which was interrupted, begins anew"))
+        on_event(Warned(f"{error.where} is damaged: the interrupted conversion starts again"))
         return False
     return True
 
@@ -311,7 +313,7 @@ def _check_destination(
         )
     if path.is_dir() and any(path.iterdir()) and not _is_zarr(path):
         raise DestinationError(
-            "this folder holds something else",
+            "the output folder already holds other files",
             str(path),
             "nothing, or a Zarr store",
             f"a folder with {next(path.iterdir()).name}",

@@ -109,7 +109,7 @@ def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
                     raise SourceError("there are more values than the first line names", where, expected, got, remedy)
                 frame, shift = _parse_row(row, where, n_frames, remedy)
                 if frame in line_of:
-                    what = f"frame {frame} is there twice"
+                    what = f"frame {frame} occurs twice"
                     raise SourceError(what, where, "each frame once", f"also in line {line_of[frame]}", remedy)
                 line_of[frame], drift[frame] = reader.line_num, shift
     except (OSError, UnicodeDecodeError, csv.Error) as error:

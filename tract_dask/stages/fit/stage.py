@@ -77,7 +77,7 @@ def fit_movie(
         except DamagedPartError as error:
             if attempt == _ATTEMPTS - 1:
                 raise
-            on_event(Warned(f"{error.what}: they are made anew"))
+            on_event(Warned(f"{error.what}: they are made again"))
     results.finish(path, summary=summary, processors=sorted(processors))
     journal.remove()
     if len(mixed := widths(processors)) > 1:
@@ -95,7 +95,7 @@ def _goes_on(path: Path, key: str, on_event: Sink) -> bool:
         remove_journal(journal_beside(path))
         return False
     if damage := results.damage(path):
-        on_event(Warned(f"{damage.where} is damaged: the store is made anew, with the fits that are done"))
+        on_event(Warned(f"{damage.where} is damaged: the store is made again, with the fits that are done"))
         return False
     return True
 
