@@ -4,7 +4,6 @@ import asyncio
 import re
 import sqlite3
 import threading
-import time
 from types import SimpleNamespace
 
 import httpx
@@ -18,9 +17,9 @@ from tract_dask.errors import DestinationError, InputError
 from tract_dask.service import server as service_server
 from tract_dask.service.app import create_app
 from tract_dask.service.auth import gate
-from tract_dask.service.auth.tokens import Attempts, Credential, Identity, may_change
+from tract_dask.service.auth.tokens import Credential, Identity, may_change
 from tract_dask.service.config import ServiceConfig
-from tract_dask.service.errors import ForbiddenError, TooManyError
+from tract_dask.service.errors import ForbiddenError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.pages import pages
 from tract_dask.service.pages.dask_proxy import canonical, dashboard, may_pass
@@ -228,23 +227,11 @@ def test_another_site_cannot_log_a_browser_in(client, tokens):
         assert "set-cookie" not in answer.headers
 
 
-def test_who_guesses_has_to_wait(client, tokens, monkeypatch):
-    attempts = Attempts(limit=3, window_s=60.0, addresses=2)
-    monkeypatch.setattr("tract_dask.service.pages.login._attempts", attempts)
-    assert [
-        client.post("/login", headers={"Origin": HERE}, data={"token": "tract_0_x"}).status_code for _ in range(4)
-    ] == [401, 401, 401, 429]
-    assert client.post("/login", headers={"Origin": HERE}, data={"token": tokens["user"]}).status_code == 429
-    attempts.check("another")
-    for address in ("b", "c"):
-        attempts.failed(address)
-    attempts.check("testclient")  # only so many addresses are remembered
-    quick = Attempts(limit=1, window_s=0.5)
-    quick.failed("a")
-    with pytest.raises(TooManyError):
-        quick.check("a")
-    time.sleep(0.6)
-    quick.check("a")
+def test_failed_logins_lock_nobody_out(client, tokens):
+    """A guess at 256 bits never succeeds, and others may share the address of who guesses: a proxy's, say."""
+    for _ in range(20):
+        assert client.post("/login", headers={"Origin": HERE}, data={"token": "tract_0_x"}).status_code == 401
+    assert client.post("/login", headers={"Origin": HERE}, data={"token": tokens["user"]}).status_code == 303
 
 
 FOREIGN = [

@@ -8,12 +8,10 @@ from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from ..auth.gate import LOGIN, cookie_name, read_cookie
-from ..auth.tokens import Access, Attempts
-from ..errors import TooManyError
+from ..auth.tokens import Access
 from . import templates
 
 login = APIRouter(include_in_schema=False)
-_attempts = Attempts()
 
 
 @login.get(LOGIN)
@@ -30,14 +28,8 @@ def log_in(
 ) -> Response:
     """Open a session for the holder of a token."""
     access: Access = request.app.state.access
-    address = request.client.host if request.client else ""
-    try:
-        _attempts.check(address)
-    except TooManyError as error:
-        return _form(request, to, str(error), 429)
     session = access.open_session(token.strip())
     if session is None:
-        _attempts.failed(address)
         return _form(request, to, "This token is not valid.", 401)
     config = request.app.state.config
     response = RedirectResponse(_local(to), 303)
