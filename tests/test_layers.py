@@ -97,31 +97,33 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "process_pool": ["crashes"],
         "errors": ["data_root", "crashes", "jobs"],
         "outputs": ["data_root", "errors"],
-        "checks": ["data_root", "jobs", "outputs"],
+        "job_settings": ["data_root"],
         "deletion": ["data_root", "jobs", "outputs"],
         "events": ["jobs"],
         "views": ["process_pool"],
         "client": ["client_answers", "jobs"],
         "auth": ["jobs", "config", "errors"],
         "metrics": ["jobs", "events"],
-        "runner": ["data_root", "crashes", "jobs", "config", "outputs", "checks", "deletion"],
-        "pages": ["errors", "auth"],
-        "error_handlers": ["jobs", "errors", "pages"],
-        "api": ["data_root", "jobs", "errors", "checks", "deletion", "events", "process_pool", "views", "auth"],
-        "app": [
+        "runner": ["data_root", "crashes", "jobs", "config", "outputs", "job_settings", "deletion"],
+        "upstream": [],
+        "services": ["jobs", "config", "process_pool", "events", "views", "auth", "metrics", "runner", "upstream"],
+        "checks": ["data_root", "jobs", "outputs", "job_settings", "services"],
+        "pages": ["auth", "services"],
+        "error_handlers": ["data_root", "jobs", "errors", "pages"],
+        "api": [
+            "data_root",
             "jobs",
-            "config",
-            "process_pool",
+            "errors",
+            "job_settings",
+            "deletion",
             "events",
             "views",
             "auth",
-            "metrics",
-            "runner",
-            "pages",
-            "error_handlers",
-            "api",
+            "services",
+            "checks",
         ],
-        "notebook": ["data_root", "jobs", "config", "auth", "pages", "error_handlers", "api"],
+        "app": ["config", "auth", "metrics", "services", "pages", "error_handlers", "api"],
+        "notebook": ["data_root", "jobs", "views", "auth", "pages", "error_handlers", "api"],
         "server": ["data_root", "jobs", "config", "events", "auth", "app"],
     },
 }
@@ -190,6 +192,12 @@ def test_rooms_import_what_the_table_says(rooms, table):
     }
     for room, others in table.items():
         assert all(order.index(other) < order.index(room) for other in others), f"{room} imports from its right"
+
+
+def test_routes_reach_the_parts_of_the_application_typed():
+    """The untyped state of the application is known where it is made, where it is read, and where it is served."""
+    named = {file.stem for file in (PACKAGE / "service").rglob("*.py") if "app.state" in file.read_text("utf-8")}
+    assert named == {"app", "services", "server"}
 
 
 def test_no_modules_import_each_other():

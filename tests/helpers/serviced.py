@@ -14,23 +14,19 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI
 
+from tract_dask.service.api.column_desk import Threads
 from tract_dask.service.app import create_app
 from tract_dask.service.config import ServiceConfig
+from tract_dask.service.services import Services
 from tract_dask.service.views.exports import Exports
 
 FRAMES = (12, 48, 40)
 
 
-class Here:
+class Here(Threads):
     """A workshop without processes: work is done in a thread."""
 
-    async def run(self, function: Callable[..., Any], *args: Any, **limits: Any) -> Any:
-        return await asyncio.to_thread(function, *args)
-
     async def run_long(self, function: Callable[..., Any], *args: Any, **limits: Any) -> Any:
-        return await asyncio.to_thread(function, *args)
-
-    async def run_kept(self, key: str, function: Callable[..., Any], *args: Any, **limits: Any) -> Any:
         return await asyncio.to_thread(function, *args)
 
 
@@ -49,8 +45,9 @@ def make_root(root: Path) -> Path:
 
 def make_app(root: Path, **config: Any) -> FastAPI:
     app = create_app(ServiceConfig(root, **config))
-    app.state.workshop = Here()
-    app.state.exports = Exports(app.state.config.state / "exports", app.state.workshop)
+    services: Services = app.state.services
+    services.workshop = Here()
+    services.exports = Exports(services.config.state / "exports", services.workshop)
     return app
 
 
@@ -66,6 +63,6 @@ def listening(root: Path, **config: Any) -> Iterator[tuple[str, FastAPI]]:
         try:
             yield f"http://127.0.0.1:{port}", app
         finally:
-            app.state.feed.close()
+            app.state.services.feed.close()
             server.should_exit = True
             thread.join()

@@ -38,7 +38,7 @@ from tract_dask.settings import FitSettings, RunSettings
 def service(tmp_path_factory):
     """A service that runs nothing by itself, and its store: the tests decide what happens to the jobs."""
     with listening(make_root(tmp_path_factory.mktemp("service") / "data")) as (url, app):
-        yield url, app.state.store, app
+        yield url, app.state.services.store, app
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def client(service):
 @pytest.fixture
 def jobs(service) -> JobStore:
     _, store, app = service
-    until(lambda: len(app.state.feed) == 0)
+    until(lambda: len(app.state.services.feed) == 0)
     for job in store.jobs(limit=500):
         if job.state == State.RUNNING:
             store.change(job.id, State.CANCELLED)
@@ -74,8 +74,8 @@ def stages(fit: str, done: int, seconds: float | None = None) -> dict:
 
 def run(app, job_id: str, end: State = State.DONE, reason: str = "") -> None:
     """What a runner would make of a job, once somebody watches."""
-    store = app.state.store
-    until(lambda: len(app.state.feed) > 0)
+    store = app.state.services.store
+    until(lambda: len(app.state.services.feed) > 0)
     time.sleep(0.1)
     store.change(job_id, State.RUNNING)
     store.progress(job_id, stages("running", 4))
@@ -183,7 +183,7 @@ def test_watching_goes_on_over_a_restart_of_the_service_without_a_gap(tmp_path):
     seen: list[str] = []
     with contextlib.ExitStack() as stack:
         url, app = stack.enter_context(listening(root))
-        store = app.state.store
+        store = app.state.services.store
         job = store.submit(source="movie.npy", settings={}, owner="local")
         client = stack.enter_context(ServiceClient(url))
 
@@ -192,15 +192,15 @@ def test_watching_goes_on_over_a_restart_of_the_service_without_a_gap(tmp_path):
 
         thread = threading.Thread(target=watch)
         thread.start()
-        until(lambda: len(app.state.feed) > 0)
+        until(lambda: len(app.state.services.feed) > 0)
         time.sleep(0.1)
         for k in range(3):
             store.log(job.id, "info", f"before {k}")
         time.sleep(0.4)
-        app.state.feed.close()  # it ends the stream, and refuses others, as a service does that stops
+        app.state.services.feed.close()  # it ends the stream, and refuses others, as a service does that stops
         for k in range(3):
             store.log(job.id, "info", f"meanwhile {k}")
-        app.state.feed._closed = False
+        app.state.services.feed._closed = False
         time.sleep(0.8)
         store.log(job.id, "info", "after")
         store.change(job.id, State.CANCELLED)
@@ -247,7 +247,7 @@ def test_results_come_whole_or_not_at_all(client, jobs, service, tmp_path):
     job = client.submit("movie.npy")
     with pytest.raises(MissingStoreError):
         client.download(job.id, tmp_path / "early.zip")
-    fits = Fits(app.state.root.path / job.output)
+    fits = Fits(app.state.services.root.path / job.output)
     fits.create()
     fits.finish()
     truth = open_results(fits.path)
@@ -285,7 +285,7 @@ def test_columns_are_sent_as_the_service_takes_them(monkeypatch):
 
 def test_a_token_is_needed_and_taken_where_the_service_demands_one(tmp_path, monkeypatch):
     with listening(make_root(tmp_path / "data"), tokens=True) as (url, app):
-        token = app.state.access.create_token("ana")
+        token = app.state.services.access.create_token("ana")
         with ServiceClient(url) as nobody, pytest.raises(InputError, match="a token is needed"):
             nobody.jobs()
         with ServiceClient(url, token) as ana:

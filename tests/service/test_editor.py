@@ -372,6 +372,20 @@ def test_nobody_sees_it_without_the_secret(opened: Seat) -> None:
     assert editor.url in editor._repr_html_()
 
 
+def test_a_notebook_serves_the_routes_of_the_editor_only(opened: Seat) -> None:
+    """It keeps versions in memory, and the image and the first columns in a folder that goes with it."""
+    editor = opened.editor
+    assert sorted(path.name for path in pathlib.Path(editor._folder.name).iterdir()) == ["columns.zarr", "sum.zarr"]
+    jobs = f"{editor.url}api/v1/jobs/0000000000"
+    assert httpx.get(f"{jobs}/sum").status_code == 200
+    assert httpx.get(f"{editor.url}api/v1/files/frame.png?path=sum.zarr").status_code == 404
+    for answer in (
+        httpx.get(f"{jobs}/columns/999"),
+        httpx.post(f"{jobs}/continue", json={"version": 999}),
+    ):
+        assert (answer.status_code, answer.json()["error"]["kind"]) == (404, "UnknownVersionError")
+
+
 def test_the_folder_of_a_run_is_enough(tmp_path: Any) -> None:
     with pytest.raises(StoreError, match="there is no Dataset here"):
         edit_columns(tmp_path)

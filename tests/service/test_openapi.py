@@ -41,7 +41,7 @@ CHECKED = (
 def service(tmp_path_factory):
     """A service with jobs in several states, one with results; its streams end at once."""
     with listening(make_root(tmp_path_factory.mktemp("service") / "data")) as (url, app):
-        store = app.state.store
+        store = app.state.services.store
         jobs = [store.submit(source="movie.npy", settings={}, owner="local", label=f"job {k}") for k in range(4)]
         store.change(jobs[0].id, State.RUNNING)
         part = {"state": "running", "seconds": 1.0, "started": jobs[0].created, "ended": None, "summary": ""}
@@ -50,11 +50,11 @@ def service(tmp_path_factory):
         store.log(jobs[0].id, "info", "it runs")
         store.change(jobs[1].id, State.RUNNING)
         store.change(jobs[1].id, State.FAILED, "the disk was full")
-        fits = Fits(app.state.root.path / jobs[1].output)
+        fits = Fits(app.state.services.root.path / jobs[1].output)
         fits.create()
         fits.finish()
-        app.state.feed.close()
-        app.state.runner.is_alive = lambda: True  # what GET /health calls well
+        app.state.services.feed.close()
+        app.state.services.runner.is_alive = lambda: True  # what GET /health calls well
         yield url, [job.id for job in jobs], app
 
 

@@ -43,7 +43,7 @@ def submit(api: TestClient, **more) -> dict:
 
 def put(api: TestClient, job: dict, *states: State) -> None:
     for state in states:
-        api.app.state.store.change(job["id"], state)
+        api.app.state.services.store.change(job["id"], state)
 
 
 def test_a_job_is_kept_as_it_was_submitted(api, root):
@@ -58,7 +58,7 @@ def test_a_job_is_kept_as_it_was_submitted(api, root):
     detail = api.get(f"jobs/{job['id']}").json()
     assert {name: detail[name] for name in job} == job
     assert [change["state"] for change in detail["transitions"]] == ["queued"]
-    assert detail["event"] == api.app.state.store.newest_event()
+    assert detail["event"] == api.app.state.services.store.newest_event()
     assert detail["links"]["events"] == f"/api/v1/jobs/{job['id']}/events"
 
 
@@ -123,7 +123,7 @@ def test_what_cannot_be_done_is_refused_with_its_reason(api, body, status, words
     assert answer.status_code in ((400, 422) if status == 422 else (status,)), parts
     assert all(word in parts["text"] for word in words), parts["text"]
     assert parts["what"]
-    assert str(api.app.state.root.path) not in answer.text  # a user knows the root's inside only
+    assert str(api.app.state.services.root.path) not in answer.text  # a user knows the root's inside only
     assert api.get("jobs").json()["jobs"] == []
 
 
@@ -158,7 +158,7 @@ def test_a_job_is_cancelled_tried_again_named_and_forgotten(api):
     assert api.post(f"{place}/label", json={"label": "new"}).json()["label"] == "new"
     put(api, job, State.RUNNING)
     assert api.post(f"{place}/cancel").json()["state"] == "running"  # its process ends first
-    assert api.app.state.store.cancel_requested(job["id"])
+    assert api.app.state.services.store.cancel_requested(job["id"])
     assert api.delete(place).status_code == 409
     put(api, job, State.CANCELLED)
     assert api.delete(place).json() == {"id": job["id"], "files": False, "kept": ""}
@@ -189,7 +189,7 @@ def test_a_plan_is_that_of_the_run(api, root, monkeypatch):
         assert plan[name] == getattr(truth, name)
     assert (plan["shape"], plan["dtype"], plan["fits"], plan["problem"]) == (list(FRAMES), "uint8", True, "")
     assert plan["seconds"] == pytest.approx(checks.STARTUP_S, abs=0.1)  # a tenth of a megabyte takes no time
-    keeper = api.app.state.runner.keeper
+    keeper = api.app.state.services.runner.keeper
     monkeypatch.setattr(keeper, "workers", lambda: [{"memory_limit": 10_000_000}, {"memory_limit": 0}])
     small = api.post("plan", json={"source": "movie.npy"}).json()
     assert (small["fits"], small["memory_limit"]) == (False, 10_000_000)
@@ -206,7 +206,7 @@ def test_the_time_of_a_job_is_estimated_from_those_before(api, root, monkeypatch
     raw = np.prod(FRAMES)
     seconds = {"convert": 400.0, "drift": 200.0, "sum": 100.0, "columns": 10.0, "fit": 290.0}
     put(api, job, State.RUNNING)
-    api.app.state.store.change(job["id"], State.DONE, outcome={"seconds": seconds})
+    api.app.state.services.store.change(job["id"], State.DONE, outcome={"seconds": seconds})
     (root / job["output"]).mkdir(parents=True)
     plan = api.post("plan", json={"source": "movie.npy"}).json()
     assert plan["seconds"] == pytest.approx(checks.STARTUP_S + raw / 1e6, abs=0.06)  # a gigabyte took 1000 s
@@ -260,7 +260,7 @@ def test_workers_are_those_that_the_keeper_sees(api, monkeypatch):
     assert api.get("workers").json() == {"workers": [], "dashboard": False}
     worker = {"name": "0", "address": "tcp://127.0.0.1:1", "cpu": 99.5, "memory": 5, "memory_limit": 7}
     worker |= {"executing": 1, "stage": "fit"}
-    monkeypatch.setattr(api.app.state.runner.keeper, "workers", lambda: [worker])
+    monkeypatch.setattr(api.app.state.services.runner.keeper, "workers", lambda: [worker])
     assert api.get("workers").json()["workers"] == [worker]
 
 
@@ -270,7 +270,7 @@ KEEPS_NOTHING = ("refine", "lattice")
 
 def test_jobs_of_others_are_seen_and_left_alone(root):
     app = make_app(root, tokens=True)
-    access: Access = app.state.access
+    access: Access = app.state.services.access
     clients = {}
     for name, role in (("ana", "user"), ("ben", "user"), ("root", "admin")):
         headers = {"Authorization": f"Bearer {access.create_token(name, role)}"}
@@ -279,7 +279,7 @@ def test_jobs_of_others_are_seen_and_left_alone(root):
     assert job["owner"] == "ana"
     place = f"jobs/{job['id']}"
     assert clients["ben"].get(place).status_code == 200
-    before = app.state.store.job(job["id"]).to_record()
+    before = app.state.services.store.job(job["id"]).to_record()
     changing = 0
     for route, operations in app.openapi()["paths"].items():
         for method in operations:
@@ -295,14 +295,14 @@ def test_jobs_of_others_are_seen_and_left_alone(root):
                     break
             assert "belongs to someone else" in answer.text, (method, route)
     assert changing >= 6
-    assert app.state.store.job(job["id"]).to_record() == before
+    assert app.state.services.store.job(job["id"]).to_record() == before
     assert clients["root"].post(f"{place}/cancel").json()["reason"] == "cancelled by root"
     assert clients["ana"].delete(place).status_code == 200
 
 
 def test_a_log_is_read_in_parts(api):
     job = submit(api)
-    store: JobStore = api.app.state.store
+    store: JobStore = api.app.state.services.store
     for k in range(25):
         store.log(job["id"], "info", f"line {k}")
     found, after = [], 0
@@ -351,7 +351,7 @@ class Listener:
 
 def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
     with listening(root) as (url, app), httpx.Client(base_url=f"{url}/api/v1") as api:
-        store: JobStore = app.state.store
+        store: JobStore = app.state.services.store
         first, other = (api.post("/jobs", json={"source": "movie.npy"}).json() for _ in range(2))
         place = f"{url}/api/v1/jobs/{first['id']}/events"
         listener, everything = Listener(place), Listener(f"{url}/api/v1/events")
@@ -388,16 +388,16 @@ def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
         store.delete(first["id"])
         assert resumed.wait_for(5)[-1][1:] == ("job", {"id": first["id"], "deleted": True})
         began = time.monotonic()
-        app.state.feed.close()
+        app.state.services.feed.close()
         assert all(one.ended.wait(10) for one in (listener, everything, resumed, stranger))
         assert time.monotonic() - began < 10  # not with the next heartbeat
 
 
 def test_a_stream_of_a_revoked_token_ends(root):
     with listening(root, tokens=True) as (url, app):
-        token = app.state.access.create_token("ana")
+        token = app.state.services.access.create_token("ana")
         listener = Listener(f"{url}/api/v1/events", {"Authorization": f"Bearer {token}"})
-        app.state.access.revoke("ana")
+        app.state.services.access.revoke("ana")
         assert listener.ended.wait(5)
 
 

@@ -69,11 +69,11 @@ class Service:
 
     def __init__(self, root: Path) -> None:
         self.app = make_app(root)
-        self.store = self.app.state.store
+        self.store = self.app.state.services.store
         self.job = self.store.submit(source="movie.tif", settings=stored(), owner="local", curate=True)
         self.found = write_run(root / self.job.output)
         self.woken = 0
-        self.app.state.runner.wake = self._woken
+        self.app.state.services.runner.wake = self._woken
         self.client = TestClient(self.app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False)
         self.reach(State.RUNNING, State.WAITING)
 
@@ -118,14 +118,14 @@ def rows(columns: xr.Dataset) -> list[dict[str, Any]]:
 
 def test_long_tables_stay_in_the_workshop(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     """To pack and unpack what is in them would hold other requests up."""
-    passed, run = [], service.app.state.workshop.run
+    passed, run = [], service.app.state.services.workshop.run
 
     async def noted(function: Any, *args: Any, **limits: Any) -> Any:
         value = await run(function, *args, **limits)
         passed.extend((*args, *(value if isinstance(value, tuple) else [value])))
         return value
 
-    monkeypatch.setattr(service.app.state.workshop, "run", noted)
+    monkeypatch.setattr(service.app.state.services.workshop, "run", noted)
     table = {"columns": rows(service.found), "note": "one", "base": 0}
     assert service.post("/columns", table, 201) == {"version": 1, "count": len(TRUTH), "newer": []}
     assert len(service.post("/columns/refine", {"columns": rows(service.found)})["columns"]) == len(TRUTH)
@@ -230,7 +230,7 @@ def test_numbers_are_finite(service: Service, number: str) -> None:
 
 
 def test_without_columns_there_is_nothing_to_edit(service: Service) -> None:
-    store = service.app.state.root.path / service.job.output / "columns.zarr"
+    store = service.app.state.services.root.path / service.job.output / "columns.zarr"
     files.remove(store)
     assert service.get("/columns", 404)["error"]["what"] == "there are no columns yet"
     service.post("/continue", {"version": 0}, 404)

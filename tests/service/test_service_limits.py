@@ -54,9 +54,9 @@ def deadly(tmp_path_factory):
     for module in (*sys.modules.values(),):
         if getattr(module, "__name__", "").startswith("tract_dask") and hasattr(module, "READERS"):
             patch.setattr(module, "READERS", module.READERS | dict.fromkeys((".crash", ".hang", ".starve"), None))
-    app.state.workshop = Workshop(2, memory=512 << 20, imported=("starving",))
+    app.state.services.workshop = Workshop(2, memory=512 << 20, imported=("starving",))
     yield TestClient(app, base_url=URL, raise_server_exceptions=False)
-    app.state.workshop.close()
+    app.state.services.workshop.close()
     patch.undo()
 
 
@@ -76,12 +76,12 @@ def test_a_file_that_kills_or_starves_its_reader_is_named(deadly, ask, kind, wor
 
 
 def test_a_file_that_hangs_its_reader_is_named(deadly, monkeypatch):
-    run = deadly.app.state.workshop.run
+    run = deadly.app.state.services.workshop.run
 
     async def soon(*args, **limits):
         return await run(*args, **limits | {"timeout_s": 1.0})
 
-    monkeypatch.setattr(deadly.app.state.workshop, "run", soon)
+    monkeypatch.setattr(deadly.app.state.services.workshop, "run", soon)
     answer = deadly.get("files/about", params={"path": "bad.hang"})
     assert answer.status_code == 422
     assert "did not finish" in answer.json()["error"]["what"]
@@ -242,7 +242,7 @@ def test_a_bad_body_is_refused(api, route, name):
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("end", ["", "/refine", "/lattice"])
 def test_a_bad_body_of_columns_is_refused(api, name, end):
-    job = api.app.state.store.submit(source="movie.npy", settings={}, owner="local")
+    job = api.app.state.services.store.submit(source="movie.npy", settings={}, owner="local")
     answer = api.post(f"jobs/{job.id}/columns{end}", content=BODIES[name])
     assert answer.status_code == 422, answer.text
     assert answer.json()["error"]["what"]
@@ -296,14 +296,14 @@ def test_a_large_answer_goes_out_in_parts():
 
 def test_a_job_is_kept_by_another_thread_than_that_of_the_requests(api, monkeypatch):
     """The job store waits for the disk."""
-    submit = api.app.state.store.submit
+    submit = api.app.state.services.store.submit
 
     def kept(**about):
         with pytest.raises(RuntimeError, match="no running event loop"):
             asyncio.get_running_loop()
         return submit(**about)
 
-    monkeypatch.setattr(api.app.state.store, "submit", kept)
+    monkeypatch.setattr(api.app.state.services.store, "submit", kept)
     assert api.post("jobs", json={"source": "movie.npy"}).status_code == 201
 
 
@@ -318,7 +318,7 @@ def test_only_tables_of_columns_may_be_long(api):
     long = json.dumps({"columns": [{"x": 1, "y": 2, "kind": ""}] * 50_000}).encode()
     assert len(long) > 1 << 20
     assert api.post("plan", content=long).status_code == 413
-    job = api.app.state.store.submit(source="movie.npy", settings={}, owner="local")
+    job = api.app.state.services.store.submit(source="movie.npy", settings={}, owner="local")
     assert api.post(f"jobs/{job.id}/columns", content=long).status_code == 404  # read, and there is no image yet
     assert api.post(f"jobs/{job.id}/label", content=long).status_code == 413
 
@@ -349,7 +349,7 @@ def test_a_shape_that_is_none_is_refused(api, root, shape):
 
 
 def test_jobs_with_long_settings_come_in_shorter_pages(api):
-    store = api.app.state.store
+    store = api.app.state.services.store
     text = "x" * 400_000
     jobs = [store.submit(source=f"{k}", settings={"fit": {"a": text}}, owner="local") for k in range(12)]
     first = api.get("jobs", params={"limit": 100}).json()
@@ -383,8 +383,10 @@ def test_nothing_holds_the_event_loop_up(root):
     for k in range(2000):
         (root / "many" / f"{k}.npy").touch()
     app = make_app(root)
-    app.state.workshop = Workshop(1, imported=("tract_dask.service.views.pictures", "tract_dask.service.api.columns"))
-    store = app.state.store
+    app.state.services.workshop = Workshop(
+        1, imported=("tract_dask.service.views.pictures", "tract_dask.service.api.columns")
+    )
+    store = app.state.services.store
     for k in range(40):
         job = store.submit(source=f"{k}.npy", settings={"columns": {"lattices": [LATTICE] * 20}}, owner="local")
     columns = json.dumps({"columns": [{"x": k, "y": k, "kind": "Ce"} for k in range(40_000)]}).encode()
@@ -417,4 +419,4 @@ def test_nothing_holds_the_event_loop_up(root):
     try:
         assert asyncio.run(ask()) == []
     finally:
-        app.state.workshop.close()
+        app.state.services.workshop.close()

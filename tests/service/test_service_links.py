@@ -266,11 +266,22 @@ def test_a_job_fails_whose_source_came_to_lead_out(api, root):
     job = api.post("jobs", json={"source": "sub/other.npy"}).json()
     (root / "sub" / "other.npy").unlink()
     (root / "sub" / "other.npy").symlink_to("/etc/passwd")
-    state = api.app.state
+    state = api.app.state.services
     state.store.change(job["id"], State.RUNNING)
     attempt = Attempt(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)
     with pytest.raises(TractError, match="data root"):
         attempt._order()
+
+
+def test_an_order_has_the_settings_as_they_are_stored(api, root):
+    """Only the paths in them are made whole; nothing is built anew."""
+    settings = {"columns": {"method": "csv", "csv": "sub/columns.csv"}, "fit": {"window_px": 9}}
+    job = api.post("jobs", json={"source": "movie.npy", "settings": settings}).json()
+    services = api.app.state.services
+    services.store.change(job["id"], State.RUNNING)
+    attempt = Attempt(services.store.job(job["id"]), services.store, services.root, None, None, lambda: None)
+    whole = job["settings"]["columns"] | {"csv": str(root / "sub" / "columns.csv")}
+    assert attempt._order()["settings"] == job["settings"] | {"columns": whole}
 
 
 @pytest.mark.parametrize("source", ["sub/other.npy", "frames", "frames/f_*.npy"])
@@ -280,7 +291,7 @@ def test_a_source_that_was_archived_is_the_runs_to_judge(api, root, source):
     np.save(root / "frames" / "f_1.npy", np.zeros(FRAMES, np.uint8))
     job = api.post("jobs", json={"source": source}).json()
     (root / source.split("/")[0]).rename(root / "archive")
-    state = api.app.state
+    state = api.app.state.services
     state.store.change(job["id"], State.RUNNING)
     order = Attempt(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)._order()
     assert order["source"] == str(root / source)

@@ -41,7 +41,7 @@ def app(root):
 
 @pytest.fixture
 def clients(app) -> dict[str, TestClient]:
-    tokens = {name: app.state.access.create_token(name, role) for name, role in OWNERS.items()}
+    tokens = {name: app.state.services.access.create_token(name, role) for name, role in OWNERS.items()}
     return {
         name: TestClient(app, base_url=URL, headers={"Authorization": f"Bearer {token}"})
         for name, token in tokens.items()
@@ -83,11 +83,11 @@ def done(app, root: Path, client: TestClient, **more) -> tuple[dict, Path]:
 
 
 def work(app, root: Path, job: dict) -> None:
-    app.state.store.change(job["id"], State.RUNNING)
+    app.state.services.store.change(job["id"], State.RUNNING)
     claim(DataRoot(root), mark_of(job))
     write_run(root / job["output"])
     seal(DataRoot(root), mark_of(job))
-    app.state.store.change(job["id"], State.DONE)
+    app.state.services.store.change(job["id"], State.DONE)
 
 
 def files(folder: Path) -> list[str]:
@@ -220,7 +220,7 @@ class KilledError(BaseException):
 
 @pytest.mark.parametrize("more", [{}, {"output": "named/run"}])
 def test_a_deletion_that_is_cut_off_anywhere_is_gone_on_with_at_the_next_start(app, root, clients, more, monkeypatch):
-    store = app.state.store
+    store = app.state.services.store
     for steps in count():
         job, folder = done(app, root, clients["ana"], **more)
         (folder / ".movie.zarr.x.partial").mkdir()
@@ -262,37 +262,37 @@ def _kill_after(steps: int, patch: pytest.MonkeyPatch) -> None:
 def test_what_was_changed_stays_also_where_its_deletion_was_cut_off(app, root, clients, monkeypatch):
     job, folder = done(app, root, clients["ana"], output="run")
     (folder / "run.toml").write_text("made by hand")
-    app.state.store.delete(job["id"], files=True)
+    app.state.services.store.delete(job["id"], files=True)
     with monkeypatch.context() as patch:
         _kill_after(6, patch)
         with pytest.raises(KilledError):
-            finish_deletions(DataRoot(root), app.state.store)
-    finish_deletions(DataRoot(root), app.state.store)
+            finish_deletions(DataRoot(root), app.state.services.store)
+    finish_deletions(DataRoot(root), app.state.services.store)
     assert set(files(folder)) == {"run.toml", ".lock", MARK}
-    assert app.state.store.deletions() == []
+    assert app.state.services.store.deletions() == []
 
 
 def test_a_new_job_may_take_a_folder_whose_deletion_was_cut_off(app, root, clients):
     job, folder = done(app, root, clients["ana"], output="run")
-    app.state.store.delete(job["id"], files=True)
+    app.state.services.store.delete(job["id"], files=True)
     following = submit(clients["ana"], output="run")
     work(app, root, following)
     before = files(folder)
-    finish_deletions(DataRoot(root), app.state.store)
+    finish_deletions(DataRoot(root), app.state.services.store)
     assert files(folder) == before
-    assert app.state.store.deletions() == []
+    assert app.state.services.store.deletions() == []
 
 
 def test_the_runner_goes_on_with_deletions_when_it_starts(app, root, clients, monkeypatch):
     job, folder = done(app, root, clients["ana"])
-    app.state.store.delete(job["id"], files=True)
+    app.state.services.store.delete(job["id"], files=True)
     for name in ("start", "stop"):
         monkeypatch.setattr(Keeper, name, lambda keeper: None)
-    app.state.runner.start()
+    app.state.services.runner.start()
     deadline = monotonic() + 20
-    while app.state.store.deletions() and monotonic() < deadline:
+    while app.state.services.store.deletions() and monotonic() < deadline:
         sleep(0.01)
-    app.state.runner.stop()
+    app.state.services.runner.stop()
     assert not folder.exists()
 
 

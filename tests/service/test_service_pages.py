@@ -37,7 +37,7 @@ PAIRS = [
 def service(tmp_path_factory):
     """A service whose jobs do what the test says: its address and its store."""
     with listening(make_root(tmp_path_factory.mktemp("root"))) as (address, app):
-        yield address, app.state.store
+        yield address, app.state.services.store
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_a_movie_is_chosen_looked_at_and_measured_from_the_page(chromium, tmp_pa
         listening(tmp_path, cluster=ClusterSettings(workers=1)) as (address, app),
         visit(chromium, address) as page,
     ):
-        app.state.runner.start()
+        app.state.services.runner.start()
         try:
             page.goto("/")
             page.locator("#nothing").get_by_role("link", name="New job").click()
@@ -129,8 +129,8 @@ def test_a_movie_is_chosen_looked_at_and_measured_from_the_page(chromium, tmp_pa
             expect(page.locator(".stage[data-stage=convert]")).to_have_attribute("data-state", "done", timeout=RUN_MS)
             expect(page.locator("#badge")).to_have_text("Done", timeout=RUN_MS)
         finally:
-            app.state.runner.stop()
-        done = app.state.store.job(job)
+            app.state.services.runner.stop()
+        done = app.state.services.store.job(job)
         assert done.settings["metadata"]["pixel_size_pm"] == 8.0
         assert done.settings["convert"]["shard_mb"] == 1.0
         assert done.outcome["columns"] == len(scene.place)

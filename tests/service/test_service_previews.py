@@ -152,7 +152,7 @@ def service(tmp_path_factory):
     summed = {"image": (("y", "x"), image), "exposure": (("y", "x"), exposure)}
     datasets.write_dataset(xr.Dataset(summed, attrs={"pixel_size_pm": 4.0}), tmp_path / "out" / "sum.zarr")
     app = make_app(tmp_path)
-    job = app.state.store.submit(source="movie.npy", settings={}, owner="local", output="out")
+    job = app.state.services.store.submit(source="movie.npy", settings={}, owner="local", output="out")
     client = TestClient(app, base_url=URL)
     client.job, client.movie, client.image = f"jobs/{job.id}", movie, np.where(exposure > 0, image, np.nan)
     return client
@@ -200,7 +200,7 @@ def test_the_sum_is_shown_with_gaps_where_nothing_was_exposed(service):
 
 
 def test_a_picture_is_asked_for_again_only_when_it_changed(service):
-    file = service.app.state.root.path / "changing.npy"
+    file = service.app.state.services.root.path / "changing.npy"
     np.save(file, service.movie)
     first = service.get("files/frame.png?path=changing.npy&frame=1")
     known = {"If-None-Match": first.headers["etag"]}

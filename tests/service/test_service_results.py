@@ -100,9 +100,9 @@ def empty(tmp_path_factory) -> Path:
 def service(tmp_path, empty):
     """A client of the API, with a job in ``job`` whose folder holds results that are not written yet, ``fits``."""
     app = make_app(tmp_path)
-    app.state.exports = Exports(tmp_path / ".tract_dask" / "exports", Here())
+    app.state.services.exports = Exports(tmp_path / ".tract_dask" / "exports", Here())
     np.save(tmp_path / "movie.npy", np.zeros((2, 8, 8), np.uint8))
-    job = app.state.store.submit(source="movie.npy", settings={}, owner="local", output="out")
+    job = app.state.services.store.submit(source="movie.npy", settings={}, owner="local", output="out")
     shutil.copytree(empty, tmp_path / "out" / "results.zarr")
     client = TestClient(app, base_url=URL)
     client.job, client.fits = f"jobs/{job.id}", Fits(tmp_path / "out")
@@ -274,7 +274,7 @@ def test_a_store_too_large_to_be_copied_is_read_itself(service, tmp_path, monkey
 def test_a_copy_is_made_anew_where_it_was_deleted(service, tmp_path):
     service.fits.finish()
     before = get(service, "/series/1")
-    folder = service.app.state.config.state / "tracks"
+    folder = service.app.state.services.config.state / "tracks"
     (place,) = folder.iterdir()
     (place / "series.f8").unlink()
     (place / "frames.f8").unlink()

@@ -36,7 +36,7 @@ def job(tmp_path_factory):
     image["exposure"] = (("y", "x"), np.full(SHAPE, 5, np.uint32))
     datasets.write_dataset(xr.Dataset(image, attrs={"pixel_size_pm": 4.0}), root / "out" / "sum.zarr")
     with listening(root) as (address, app):
-        made = app.state.store.submit(source="movie.npy", settings={}, owner="local", output="out")
+        made = app.state.services.store.submit(source="movie.npy", settings={}, owner="local", output="out")
         yield f"{address}/jobs/{made.id}/results", fits
 
 

@@ -11,27 +11,18 @@ from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer
 from starlette.middleware.errors import ServerErrorMiddleware
 
-from ..cluster.connect import local_memory_limit
-from . import error_handlers
 from .api import columns, events, files, health, jobs, plan, previews, results
 from .auth.gate import Gate
 from .auth.headers import BodyLimit, SecurityHeaders
-from .auth.tokens import Access
 from .config import ServiceConfig
-from .events import Feed
-from .jobs.store import JobStore
-from .metrics import CountRequests, Metrics
+from .error_handlers import ErrorHandlers
+from .metrics import CountRequests
 from .pages import pages, static_files
-from .pages.dask_proxy import Upstream, dashboard
+from .pages.dask_proxy import dashboard
 from .pages.login import login
-from .process_pool import Workshop
-from .runner.runner import Runner
-from .views.exports import Exports
+from .services import Services
 
 PREFIX = "/api/v1"
-
-REQUEST_BYTES = 2 << 30
-"""Private memory that a request may take, or as much as a worker of the cluster may have, if that is less."""
 
 _BEARER = HTTPBearer(
     auto_error=False,  # for the document only: the gate has asked already
@@ -46,15 +37,16 @@ def _operation_id(route: APIRoute) -> str:
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    app.state.runner.start()
-    app.state.workshop.start()
+    services: Services = app.state.services
+    services.runner.start()
+    services.workshop.start()
     try:
         yield
     finally:
-        app.state.feed.close()
-        await app.state.upstream.close()
-        app.state.runner.stop()
-        app.state.workshop.close()
+        services.feed.close()
+        await services.upstream.close()
+        services.runner.stop()
+        services.workshop.close()
 
 
 def create_app(config: ServiceConfig) -> FastAPI:
@@ -68,17 +60,10 @@ def create_app(config: ServiceConfig) -> FastAPI:
         generate_unique_id_function=_operation_id,
         lifespan=_lifespan,
     )
-    config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
-    app.state.config, app.state.root = config, config.root
-    app.state.store = JobStore(config.database)
-    app.state.workshop = Workshop(memory=min(REQUEST_BYTES, local_memory_limit(config.cluster)))
-    app.state.exports = Exports(config.state / "exports", app.state.workshop)
-    app.state.feed = Feed(app.state.store)
-    app.state.metrics = Metrics(app.state.store, app.state.feed)
-    app.state.access = Access(app.state.store, config)
-    app.state.runner, app.state.upstream = Runner(config, app.state.store), Upstream(config.cluster.tls)
-    error_handlers.install(app)
-    documented = [Depends(_BEARER)] if app.state.access.demanded else []
+    app.state.services = services = Services(config)
+    handlers = ErrorHandlers(services.root, services.store.path)
+    handlers.install(app)
+    documented = [Depends(_BEARER)] if services.access.demanded else []
     for part in (jobs, events, files, plan, previews, columns, results, health):
         app.include_router(part.router, prefix=PREFIX, dependencies=documented)
     app.include_router(pages)
@@ -86,8 +71,8 @@ def create_app(config: ServiceConfig) -> FastAPI:
     app.include_router(dashboard)
     app.mount("/static", static_files, name="static")
     app.add_middleware(BodyLimit, most=config.max_body_bytes)  # the last one added is the first to see a request
-    app.add_middleware(Gate, access=app.state.access, config=config)
-    app.add_middleware(ServerErrorMiddleware, handler=error_handlers.unexpected)  # what it answers has the headers, too
+    app.add_middleware(Gate, access=services.access, config=config)
+    app.add_middleware(ServerErrorMiddleware, handler=handlers.unexpected)  # what it answers has the headers, too
     app.add_middleware(SecurityHeaders)
-    app.add_middleware(CountRequests, metrics=app.state.metrics)
+    app.add_middleware(CountRequests, metrics=services.metrics)
     return app

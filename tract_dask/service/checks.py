@@ -9,14 +9,13 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from anyio import to_thread
-from starlette.datastructures import State as AppState
 
 from ..cluster.connect import local_memory_limit, memory_limit
-from ..errors import ClusterError, SettingsError, TractError
+from ..errors import ClusterError, TractError
 from ..progress import STAGES
 from ..readers import open_source
 from ..readers.listing import FileList
@@ -24,13 +23,17 @@ from ..readers.source import Permit
 from ..run.checks import check_inputs, check_output
 from ..run.plan import Plan, plan_run
 from ..settings.run import RunSettings, SourceSettings
-from ..settings.toml import from_dict, to_dict
+from ..settings.toml import from_dict
 from ..store.movie import open_movie
 from ..store.run_folder import RunFolder
 from .data_root import DataRoot
+from .job_settings import inside, stored_settings
 from .jobs.states import State
 from .jobs.store import JobStore
 from .outputs import Mark, check_owner
+
+if TYPE_CHECKING:
+    from .services import Services  # the processes of the pool do without
 
 BYTES_PER_S = 60e6
 """Raw bytes of a movie that a whole run gets through in a second on two cores, before any job has told better."""
@@ -52,59 +55,14 @@ class Checked:
     plan: Plan
 
 
-def job_settings(values: dict[str, Any]) -> RunSettings:
-    """Return the settings of a job.
-
-    Raises
-    ------
-    SettingsError
-        Where one does not exist, is out of range, or is not a job's to decide.
-    """
-    if "cluster" in values:
-        raise SettingsError(
-            "a job cannot choose the cluster",
-            "settings",
-            f"groups {', '.join(name for name in values if name != 'cluster') or 'of the run'}",
-            "cluster",
-            "Leave it out; serve --cluster sets it",
-        )
-    return from_dict(RunSettings, values)
-
-
-def stored_settings(settings: RunSettings) -> dict[str, Any]:
-    """Return the settings as a job keeps them."""
-    found = to_dict(settings)
-    del found["cluster"]
-    return found
-
-
-def inside(root: DataRoot, settings: RunSettings) -> RunSettings:
-    """Return the settings with whole paths, each checked to lie under the data root.
-
-    Raises
-    ------
-    OutsideError, MissingStoreError
-        As :meth:`DataRoot.resolve`.
-    """
-
-    def whole(path: str | None) -> str | None:
-        return None if path is None else str(root.resolve(path))
-
-    return dataclasses.replace(
-        settings,
-        drift=dataclasses.replace(settings.drift, csv=whole(settings.drift.csv)),
-        columns=dataclasses.replace(settings.columns, csv=whole(settings.columns.csv)),
-    )
-
-
 async def check_job(
-    state: AppState, owner: str, source: str, values: dict[str, Any], output: str = ""
+    services: Services, owner: str, source: str, values: dict[str, Any], output: str = ""
 ) -> tuple[dict[str, Any], str, Checked]:
     """Check a job; return its settings as they are stored, its folder relative to the root, and what it will take.
 
     Parameters
     ----------
-    state
+    services
         Of the application.
     owner
         Whose job it is.
@@ -118,26 +76,26 @@ async def check_job(
     TractError
         Where it cannot be done: the movie, the settings or the folder cannot be used.
     """
-    root: DataRoot = state.root
+    root: DataRoot = services.root
     stored, place, whole = await to_thread.run_sync(_checked_parts, root, owner, source, values, output)
     folder = root.path / output if output else None
     file = root.path / source
-    checked = await state.workshop.run(check_source, place, whole, folder, root.permit, about=file)
+    checked = await services.workshop.run(check_source, place, whole, folder, root.permit, about=file)
     return stored, output, checked
 
 
 def _checked_parts(
     root: DataRoot, owner: str, source: str, values: dict[str, Any], output: str
-) -> tuple[dict[str, Any], str | FileList, RunSettings]:
+) -> tuple[dict[str, Any], str | FileList, dict[str, Any]]:
     """Return the settings to be stored, the movie, and the settings with whole paths; all that is named may be used."""
-    settings = job_settings(values)
+    stored = stored_settings(values)
     if output:
         check_owner(root, Mark(owner, "", output))
-    return stored_settings(settings), root.source(source), inside(root, settings)
+    return stored, root.source(source), inside(root, stored)
 
 
 async def plan_job(
-    state: AppState, owner: str, source: str, values: dict[str, Any], output: str = ""
+    services: Services, owner: str, source: str, values: dict[str, Any], output: str = ""
 ) -> dict[str, Any]:
     """Return what a job would take, by name as in :class:`tract_dask.service.api.plan.PlanAnswer`.
 
@@ -146,14 +104,14 @@ async def plan_job(
     TractError
         As :func:`check_job`; that it does not fit into memory or onto the disk is part of the answer.
     """
-    _, _, checked = await check_job(state, owner, source, values, output)
-    return await to_thread.run_sync(_measured, state, checked)
+    _, _, checked = await check_job(services, owner, source, values, output)
+    return await to_thread.run_sync(_measured, services, checked)
 
 
-def _measured(state: AppState, checked: Checked) -> dict[str, Any]:
-    plan = dataclasses.replace(checked.plan, memory_limit=_memory_limit(state))
-    seconds = STARTUP_S + _raw_bytes(checked.shape, checked.dtype) / _bytes_per_s(state.store, state.root)
-    free = shutil.disk_usage(state.root.path).free
+def _measured(services: Services, checked: Checked) -> dict[str, Any]:
+    plan = dataclasses.replace(checked.plan, memory_limit=_memory_limit(services))
+    seconds = STARTUP_S + _raw_bytes(checked.shape, checked.dtype) / _bytes_per_s(services.store, services.root)
+    free = shutil.disk_usage(services.root.path).free
     problem = _problem(plan, free)
     amounts = ("frames", "shards", "bytes_read", "bytes_written", "peak_memory", "memory_limit")
     return {name: getattr(plan, name) for name in amounts} | {
@@ -180,11 +138,11 @@ def _problem(plan: Plan, free: int) -> str:
     return ""
 
 
-def _memory_limit(state: AppState) -> int | None:
+def _memory_limit(services: Services) -> int | None:
     """Return the bytes that a task may use: of the workers that are there, else of those that would be started."""
-    if limits := [worker["memory_limit"] for worker in state.runner.keeper.workers() if worker["memory_limit"]]:
+    if limits := [worker["memory_limit"] for worker in services.runner.keeper.workers() if worker["memory_limit"]]:
         return int(min(limits))
-    cluster = state.config.cluster
+    cluster = services.config.cluster
     return local_memory_limit(cluster) if cluster.resolved_kind == "local" else memory_limit(cluster)
 
 
@@ -205,11 +163,12 @@ def _raw_bytes(shape: tuple[int, int, int], dtype: str) -> int:
     return math.prod(shape) * np.dtype(dtype).itemsize
 
 
-def check_source(place: str | FileList, settings: RunSettings, folder: Path | None, permit: Permit) -> Checked:
+def check_source(place: str | FileList, stored: dict[str, Any], folder: Path | None, permit: Permit) -> Checked:
     """Open a movie, and make the checks of a run in ``folder`` before it starts; for a process of the pool.
 
     Its first frame is read as well, unless that is very large: some files crash their reader only then.
     """
+    settings = from_dict(RunSettings, stored)
     with closing(open_source(place, settings.source, settings.metadata, permit=permit)) as source:
         check_inputs(source.shape, settings)
         if folder is not None and folder.exists():

@@ -24,6 +24,7 @@ import httpx
 
 from ..errors import ClusterError, DestinationError, InputError, ServiceError
 from ..settings.run import RunSettings
+from .jobs.records import PublicJob
 from .jobs.states import AT_REST, State
 
 if TYPE_CHECKING:
@@ -45,28 +46,10 @@ _RETRY_S = (0.5, 10.0)
 _PAGE = 200
 
 
-@dataclass(frozen=True)
-class ServiceJob:
+@dataclass(frozen=True, kw_only=True)
+class ServiceJob(PublicJob):
     """A job of the service as it was when it was read; docs/service.md says what the fields are."""
 
-    id: str
-    number: int
-    label: str
-    owner: str
-    source: str
-    output: str
-    settings: dict[str, Any]
-    curate: bool
-    state: State
-    reason: str
-    stage: str
-    created: str
-    started: str | None
-    ended: str | None
-    attempts: int
-    progress: dict[str, Any]
-    outcome: dict[str, Any]
-    columns_version: int | None
     transitions: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod

@@ -7,6 +7,7 @@ import logging
 import sqlite3
 from collections.abc import Mapping, Sequence
 from http import HTTPMethod, HTTPStatus
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -16,6 +17,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Match
 
 from ..errors import TractError
+from .data_root import DataRoot
 from .errors import answer, body, invalid
 from .jobs.tables import store_error
 from .pages import error_page
@@ -23,25 +25,42 @@ from .pages import error_page
 log = logging.getLogger(__name__)
 
 
-def install(app: FastAPI) -> None:
-    """Let the application answer every error that a route may raise in one shape."""
-    app.add_exception_handler(TractError, _tract_error)
-    app.add_exception_handler(sqlite3.Error, _store_fails)
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(HTTPException, _http)
+class ErrorHandlers:
+    """Answers every error that a route of an application may raise.
 
+    Parameters
+    ----------
+    root
+        Paths in errors are shown relative to it.
+    database
+        The file of the job store; None: the application has none.
+    """
 
-def _tract_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, TractError)
-    found = answer(error, request.app.state.root)
-    if found.status_code >= HTTPStatus.INTERNAL_SERVER_ERROR:
-        log.warning("%s %s: %s", request.method, request.url.path, error)
-    return _as_asked(request, found)
+    def __init__(self, root: DataRoot, database: Path | None = None) -> None:
+        self._root, self._database = root, database
 
+    def install(self, app: FastAPI) -> None:
+        """Let the application answer in this way."""
+        app.add_exception_handler(TractError, self._tract_error)
+        app.add_exception_handler(sqlite3.Error, self.unexpected)
+        app.add_exception_handler(RequestValidationError, _invalid)
+        app.add_exception_handler(HTTPException, _http)
 
-def _store_fails(request: Request, error: Exception) -> Response:
-    assert isinstance(error, sqlite3.Error)
-    return _tract_error(request, store_error(request.app.state.store.path, error))
+    def unexpected(self, request: Request, error: Exception) -> Response:
+        """Return the response for what nobody foresaw; it tells nothing of it, but where the job store fails."""
+        if isinstance(error, sqlite3.Error) and self._database is not None:  # also in front of the routes
+            return self._tract_error(request, store_error(self._database, error))
+        problem = TractError(
+            "the service failed", f"{request.method} {request.url.path}", remedy="Try again; its log says why it failed"
+        )
+        return _as_asked(request, JSONResponse(body(problem), HTTPStatus.INTERNAL_SERVER_ERROR))
+
+    def _tract_error(self, request: Request, error: Exception) -> Response:
+        assert isinstance(error, TractError)
+        found = answer(error, self._root)
+        if found.status_code >= HTTPStatus.INTERNAL_SERVER_ERROR:
+            log.warning("%s %s: %s", request.method, request.url.path, error)
+        return _as_asked(request, found)
 
 
 def _invalid(request: Request, error: Exception) -> Response:
@@ -77,13 +96,3 @@ def _as_asked(request: Request, found: JSONResponse) -> Response:
     if request.url.path.startswith("/api/") or "text/html" not in request.headers.get("accept", ""):
         return found
     return error_page(request, json.loads(bytes(found.body))["error"], found.status_code)
-
-
-def unexpected(request: Request, error: Exception) -> Response:
-    """Return the response for what nobody foresaw; it tells nothing of it."""
-    if isinstance(error, sqlite3.Error):  # in what stands in front of the routes
-        return _store_fails(request, error)
-    problem = TractError(
-        "the service failed", f"{request.method} {request.url.path}", remedy="Try again; its log says why it failed"
-    )
-    return _as_asked(request, JSONResponse(body(problem), HTTPStatus.INTERNAL_SERVER_ERROR))

@@ -36,10 +36,6 @@ class TooLargeError(InputError):
     """The body of the request is larger than the service takes."""
 
 
-class TooManyError(InputError):
-    """Too many attempts in a short time."""
-
-
 STATUS: dict[type[TractError], int] = {
     NoTokenError: 401,
     ForbiddenError: 403,
@@ -52,7 +48,6 @@ STATUS: dict[type[TractError], int] = {
     InvalidError: 422,
     CrashError: 422,
     ExhaustedError: 422,
-    TooManyError: 429,
     JobStoreError: 503,
     ClusterError: 503,
     InputError: 400,

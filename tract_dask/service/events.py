@@ -10,6 +10,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from .jobs.public import JobRecord
 from .jobs.records import Job, JobEvent
 from .jobs.store import JobStore
@@ -19,6 +21,7 @@ HEARTBEAT = b": still here\n\n"
 _LOG = logging.getLogger(__name__)
 _POLL_S = 0.2
 _BATCH = 500
+_RECORD = TypeAdapter(JobRecord)
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,8 @@ def _messages(events: Sequence[JobEvent]) -> list[Message]:
 
 def public_record(job: Job | dict[str, Any]) -> dict[str, Any]:
     """Return a job as every route shows it, ready for JSON."""
-    return JobRecord.model_validate(job).model_dump(mode="json")
+    record: dict[str, Any] = _RECORD.dump_python(_RECORD.validate_python(job), mode="json")
+    return record
 
 
 def chunk(number: int | None, kind: str, data: dict[str, Any]) -> bytes:

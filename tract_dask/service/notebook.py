@@ -13,10 +13,11 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import uvicorn
 import xarray as xr
@@ -26,24 +27,24 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 
 from ..settings.run import ColumnSettings, FitSettings, RunSettings
-from ..settings.toml import load, to_dict
+from ..settings.toml import load
 from ..stages.columns.find import find_columns
 from ..store import datasets, files, metadata, schema
 from ..store.columns import check_inside, columns_csv, parse_columns_csv, read_columns_csv
 from ..store.provenance import provenance
 from ..store.run_folder import RunFolder, sum_beside
-from . import error_handlers
 from .api import columns as columns_api
 from .api import previews
+from .api.column_desk import ColumnDesk, Threads, column_desk
+from .api.requests import own_job
 from .auth import tokens
 from .auth.headers import CONTENT_SECURITY_POLICY, SecurityHeaders
-from .config import ServiceConfig
-from .data_root import STATE_FOLDER, DataRoot
+from .data_root import DataRoot
+from .error_handlers import ErrorHandlers
+from .jobs.records import Job, UnknownVersionError, utc_now
 from .jobs.states import State
-from .jobs.store import JobStore
 from .pages import static_files, templates
-
-T = TypeVar("T")
+from .views.column_editing import Scene, scene_of
 
 _PREFIX = "/api/v1"
 _GONE_S = 3.0
@@ -51,6 +52,30 @@ _GONE_S = 3.0
 _LAST_ANSWERS_S = 2
 _POLICY = CONTENT_SECURITY_POLICY.replace("frame-ancestors 'none'", "frame-ancestors * vscode-webview:")
 """Notebooks show the page in a frame; who does not know the address cannot."""
+
+_JOB = Job(
+    id="0" * 10,
+    number=1,
+    label="",
+    owner=tokens.LOCAL.name,
+    source="",
+    output="",
+    settings={},
+    curate=True,
+    state=State.WAITING,
+    reason="",
+    stage="",
+    created=utc_now(),
+    started=None,
+    ended=None,
+    attempts=0,
+    progress={},
+    outcome={},
+    columns_version=None,
+    not_before=None,
+    lost_tries=0,
+)
+"""The job of the columns, as the API of the editor shows it: it always waits for them."""
 
 
 def edit_columns(
@@ -167,10 +192,10 @@ class ColumnEditor:
         self._folder = tempfile.TemporaryDirectory(prefix="tract-dask-columns-")
         self._viewers, self._done = _Viewers(), threading.Event()
         root = Path(self._folder.name)
-        self._store = _TellingStore(ServiceConfig(root, state_dir=root / STATE_FOLDER).database, self._keep)
-        self._job = _prepare(root, self._store, summed, columns, settings)
+        scene = _lay_out(root, summed, columns, settings)
+        desk = ColumnDesk(Versions(self._keep), Threads(), lambda _: root, lambda _: scene, self._done.set)
         secret = secrets.token_urlsafe(24)
-        app = _application(root, self._store, self._job, self._viewers, self._go_on)
+        app = _application(root, desk, self._viewers)
         self._server = uvicorn.Server(
             uvicorn.Config(
                 Starlette(routes=[Mount(f"/{secret}", app=app)]),
@@ -238,24 +263,55 @@ class ColumnEditor:
         if self._on_saved is not None:
             self._on_saved(self.columns)
 
-    def _go_on(self) -> None:
-        """Note that the user is done; in a notebook the columns may still be edited."""
-        self._store.change(self._job, State.RUNNING)
-        self._store.change(self._job, State.WAITING)
-        self._done.set()
 
+class Versions:
+    """The columns of one image, each version in memory: a store of one job, which may always go on.
 
-class _TellingStore(JobStore):
-    """A store that tells of the columns that are saved in it."""
+    Parameters
+    ----------
+    saved
+        Called with the table of every version that is added.
+    """
 
-    def __init__(self, path: Path, saved: Callable[[str], None]) -> None:
-        super().__init__(path)
-        self._saved = saved
+    def __init__(self, saved: Callable[[str], object]) -> None:
+        self._saved, self._job, self._lock = saved, _JOB, threading.Lock()
+        self._kept: list[tuple[dict[str, Any], str]] = []
+
+    def job(self, job_id: str) -> Job:
+        """Return the one job that there is."""
+        return self._job
+
+    def columns_versions(self, job_id: str) -> list[dict[str, Any]]:
+        """Return the versions, oldest first."""
+        return [about for about, _ in self._kept]
+
+    def columns(self, job_id: str, version: int) -> str:
+        """Return a version as a CSV table.
+
+        Raises
+        ------
+        UnknownVersionError
+            Where there is none.
+        """
+        if version > len(self._kept):
+            raise UnknownVersionError("there is no such version of the columns", remedy="See the list of versions")
+        return self._kept[version - 1][1]
 
     def add_columns(self, job_id: str, csv: str, author: str, note: str = "") -> int:
-        version = super().add_columns(job_id, csv, author, note)
-        self._saved(csv)
+        """Keep a table as the next version; return its number."""
+        with self._lock:
+            version, count = len(self._kept) + 1, len(csv.splitlines()) - 1
+            about = {"version": version, "time": utc_now(), "author": author, "note": note, "count": count}
+            self._kept.append((about, csv))
+            self._saved(csv)
         return version
+
+    def go_on(self, job_id: str, version: int) -> Job:
+        """Note the version that was chosen."""
+        if version:
+            self.columns(job_id, version)
+        self._job = replace(self._job, columns_version=version)
+        return self._job
 
 
 class _Viewers:
@@ -286,57 +342,32 @@ class _Viewers:
             self._left = monotonic()
 
 
-class _Here:
-    """Does in a thread what the service gives to its process pool."""
-
-    async def run(self, function: Callable[..., T], *args: Any, **limits: Any) -> T:
-        return await asyncio.to_thread(function, *args)
-
-    async def run_kept(self, key: str, function: Callable[..., T], *args: Any, **limits: Any) -> T:
-        return await asyncio.to_thread(function, *args)
-
-
-class _Runner:
-    """Is told when the user is done."""
-
-    def __init__(self, wake: Callable[[], None]) -> None:
-        self.wake = wake
-
-
-def _prepare(root: Path, store: JobStore, summed: xr.Dataset, columns: xr.Dataset, settings: RunSettings) -> str:
-    """Lay the image and the columns out as a run does, and return the job that waits for its columns."""
-    job = store.submit(source="", settings=to_dict(settings), owner=tokens.LOCAL.name, curate=True)
-    places = RunFolder(root / job.output)
-    places.root.mkdir(parents=True)
+def _lay_out(root: Path, summed: xr.Dataset, columns: xr.Dataset, settings: RunSettings) -> Scene:
+    """Write the image and the columns as a run does."""
+    places = RunFolder(root)
     for dataset, path in ((summed, places.sum), (columns, places.columns.with_suffix(".zarr"))):
         attributes = {name: value for name, value in dataset.attrs.items() if value is not None}
         stored = dataset.copy()
         stored.attrs = metadata.json_ready(attributes | {metadata.ATTRIBUTE: provenance("", settings.columns)})
         datasets.write_dataset(stored, path)
-    store.change(job.id, State.RUNNING)
-    store.change(job.id, State.WAITING)
-    return job.id
+    return scene_of(root, settings)
 
 
-def _application(
-    root: Path, store: JobStore, job_id: str, viewers: _Viewers, done: Callable[[], None]
-) -> SecurityHeaders:
+def _application(root: Path, desk: ColumnDesk, viewers: _Viewers) -> SecurityHeaders:
     """Return the page, its API and its files."""
     app = FastAPI(openapi_url=None)
-    app.state.root, app.state.store, app.state.workshop, app.state.runner = (
-        DataRoot(root),
-        store,
-        _Here(),
-        _Runner(done),
-    )
-    app.dependency_overrides[tokens.identity] = lambda: tokens.LOCAL
-    error_handlers.install(app)
-    for part in (previews, columns_api):
-        app.include_router(part.router, prefix=_PREFIX)
+    app.dependency_overrides = {
+        tokens.identity: lambda: tokens.LOCAL,
+        own_job: lambda: _JOB,
+        column_desk: lambda: desk,
+    }
+    ErrorHandlers(DataRoot(root)).install(app)
+    for router in (previews.sums, columns_api.router):
+        app.include_router(router, prefix=_PREFIX)
 
     @app.get("/", response_class=HTMLResponse)
     def page(request: Request) -> HTMLResponse:
-        about = {"job": store.job(job_id), "layout": "alone.html"}
+        about = {"job": _JOB, "layout": "alone.html"}
         return templates.TemplateResponse(request, "columns.html", about, headers={"Content-Security-Policy": _POLICY})
 
     @app.get("/open")

@@ -68,7 +68,7 @@ def serve(config: ServiceConfig, say: Callable[[str], None]) -> None:
         logging.getLogger(__package__).setLevel(logging.INFO)
         for line in banner(config, notes):
             say(line)
-        server = _Server(_settings(config, app), app.state.feed)
+        server = _Server(_settings(config, app), app.state.services.feed)
         with suppress(KeyboardInterrupt):  # uvicorn repeats the signal that it stopped for
             server.run(sockets=[listener])
         say("Stopped. Jobs that were running go on when the service starts again.")

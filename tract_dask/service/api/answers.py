@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, TypeVar
 
 from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -28,6 +28,18 @@ NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "As the cl
 _PART_BYTES = 256 << 10
 _FOREVER = "private, max-age=31536000, immutable"
 _ASK = "private, no-cache"
+
+T = TypeVar("T")
+
+
+class Pool(Protocol):
+    """Does the work of requests, as :class:`tract_dask.service.process_pool.Workshop` does in other processes."""
+
+    async def run(self, function: Callable[..., T], *args: Any, about: str | Path = "") -> T:
+        """Return ``function(*args)``; ``about`` is the file or folder that it reads."""
+
+    async def run_kept(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
+        """Return ``function(*args)``, which may have been kept under this ``key``."""
 
 
 def stamp(*paths: Path) -> str:
@@ -59,6 +71,7 @@ async def _parts(content: bytes) -> AsyncIterator[bytes]:
 
 async def kept_answer(
     request: Request,
+    pool: Pool,
     media_type: str,
     version: str,
     function: Callable[..., bytes],
@@ -66,7 +79,7 @@ async def kept_answer(
     about: str | Path | FileList,
     said: str = "",
 ) -> Response:
-    """Return what ``function`` makes of ``args`` in the process pool, or 304 where the client has it.
+    """Return what ``function`` makes of ``args`` in the pool, or 304 where the client has it.
 
     Parameters
     ----------
@@ -81,5 +94,5 @@ async def kept_answer(
     headers = {"ETag": f'"{key}"', "Cache-Control": _FOREVER if said == version else _ASK}
     if key in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
-    content = await request.app.state.workshop.run_kept(key, function, *args, about=about)
+    content = await pool.run_kept(key, function, *args, about=str(about))
     return whole(content, media_type, headers)

@@ -16,23 +16,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
-from ...settings.run import RunSettings
-from ...settings.toml import from_dict
 from ...stages.columns.sites import MOST_SITES
-from ...store.run_folder import COLUMNS, SUM, TABLE
 from ..auth.tokens import Identity, Role
-from ..checks import inside
 from ..errors import invalid
 from ..jobs.public import JobRecord, Plain, Text
 from ..jobs.records import Job
 from ..jobs.states import CURATABLE, State
-from ..jobs.store import JobStore
-from ..process_pool import Workshop
 from ..views import column_editing
 from ..views.column_editing import HIGHEST_ID, LONGEST_KIND, MOST_COLUMNS, Scene
 from .answers import whole
+from .column_desk import ColumnStore, Desk
 from .models import JobId, errors
-from .previews import folder_of
 from .requests import OwnJob, Who
 
 router = APIRouter(tags=["columns"])
@@ -336,32 +330,26 @@ def _answers(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
 VersionNumber = Annotated[int, Path(ge=0, lt=HIGHEST_ID, description="0: the columns found automatically.")]
 
 
-def scene_of_job(job_id: JobId, request: Request) -> Scene:
+def scene_of_job(job_id: JobId, desk: Desk) -> Scene:
     """Return the image on which the columns of a job are edited."""
-    job: Job = request.app.state.store.job(job_id)
-    settings = inside(request.app.state.root, from_dict(RunSettings, job.settings))
-    folder = folder_of(request, job_id, SUM, COLUMNS, TABLE)
-    return column_editing.scene_of(folder, settings)
+    return desk.scene(job_id)
 
 
 OfJob = Annotated[Scene, Depends(scene_of_job)]
 
 
 @router.get("/jobs/{job_id}/columns", response_model=Versions, responses=errors(400, 404, 503))
-async def list_versions(job_id: JobId, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
+async def list_versions(job_id: JobId, desk: Desk, scene: OfJob, who: Who) -> dict[str, Any]:
     """List the versions of a job's columns."""
-    first = await request.app.state.workshop.run(column_editing.summary, scene, about=scene.sum)
-    return await run_in_threadpool(_versions, request.app.state.store, job_id, first, who)
+    first = await desk.pool.run(column_editing.summary, scene, about=scene.sum)
+    return await run_in_threadpool(_versions, desk.store, job_id, first, who)
 
 
 @router.get("/jobs/{job_id}/columns/{version:int}", responses=_answers(Table))
-async def read_version(job_id: JobId, version: VersionNumber, request: Request, scene: OfJob) -> Response:
+async def read_version(job_id: JobId, version: VersionNumber, desk: Desk, scene: OfJob) -> Response:
     """Read a version of a job's columns."""
-    store: JobStore = request.app.state.store
-    table = await run_in_threadpool(store.columns, job_id, version) if version else None
-    return _json(
-        await request.app.state.workshop.run(column_editing.version_json, scene, version, table, about=scene.sum)
-    )
+    table = await run_in_threadpool(desk.store.columns, job_id, version) if version else None
+    return _json(await desk.pool.run(column_editing.version_json, scene, version, table, about=scene.sum))
 
 
 @router.post(
@@ -371,49 +359,45 @@ async def read_version(job_id: JobId, version: VersionNumber, request: Request, 
     responses=errors(400, 404, 503),
     openapi_extra=_sent(NewVersion),
 )
-async def save_version(own: OwnJob, request: Request, scene: OfJob, who: Who) -> dict[str, Any]:
+async def save_version(own: OwnJob, request: Request, desk: Desk, scene: OfJob, who: Who) -> dict[str, Any]:
     """Keep columns as a new version of a job's."""
-    store, workshop, job_id = request.app.state.store, request.app.state.workshop, own.id
-    saved = await run_in_threadpool(store.columns_versions, job_id)
-    highest = await run_in_threadpool(_highest_of, store, job_id, saved)
-    table, count, said = await workshop.run(saved_table, scene, highest, await request.body(), about=scene.sum)
+    saved = await run_in_threadpool(desk.store.columns_versions, own.id)
+    highest = await run_in_threadpool(_highest_of, desk.store, own.id, saved)
+    table, count, said = await desk.pool.run(saved_table, scene, highest, await request.body(), about=scene.sum)
     note, given_base = said["note"].strip(), said["base"]
     if given_base is not None:
         note = f"from version {given_base}: {note}" if note else f"from version {given_base}"
-    version = await run_in_threadpool(store.add_columns, job_id, table, who.name, note)
+    version = await run_in_threadpool(desk.store.add_columns, own.id, table, who.name, note)
     base = version if given_base is None else given_base
     newer = [one["version"] for one in saved if one["version"] > base]
     return {"version": version, "count": count, "newer": newer}
 
 
 @router.post("/jobs/{job_id}/columns/refine", responses=_answers(Refined), openapi_extra=_sent(ToRefine))
-async def refine_columns(job_id: JobId, request: Request, scene: OfJob) -> Response:
+async def refine_columns(job_id: JobId, request: Request, desk: Desk, scene: OfJob) -> Response:
     """Fit columns in the summed image, as a run that is given them does; nothing is kept."""
-    workshop: Workshop = request.app.state.workshop
-    return _json(await workshop.run(refined_table, scene, await request.body(), about=scene.sum))
+    return _json(await desk.pool.run(refined_table, scene, await request.body(), about=scene.sum))
 
 
 @router.post("/jobs/{job_id}/columns/lattice", responses=_answers(Sites), openapi_extra=_sent(Lattice))
-async def lattice_columns(job_id: JobId, request: Request, scene: OfJob) -> Response:
+async def lattice_columns(job_id: JobId, request: Request, desk: Desk, scene: OfJob) -> Response:
     """Make the sites of a lattice inside the summed image; nothing is kept."""
-    workshop: Workshop = request.app.state.workshop
-    return _json(await workshop.run(sites_of_lattice, scene, await request.body(), about=scene.sum))
+    return _json(await desk.pool.run(sites_of_lattice, scene, await request.body(), about=scene.sum))
 
 
 @router.post("/jobs/{job_id}/continue", response_model=JobRecord, responses=errors(400, 404, 409))
-def continue_job(own: OwnJob, choice: Choice, request: Request, scene: OfJob) -> Job:
+def continue_job(own: OwnJob, choice: Choice, desk: Desk, scene: OfJob) -> Job:
     """Let a job that waits for columns, or has ended, fit a version of them."""
-    state = request.app.state
     if not scene.exists:
         raise MissingStoreError(
             "there are no columns yet", own.id, remedy="Wait until the job has found them, or try it again"
         )
-    job: Job = state.store.go_on(own.id, choice.version)
-    state.runner.wake()
+    job = desk.store.go_on(own.id, choice.version)
+    desk.wake()
     return job
 
 
-def _versions(store: JobStore, job_id: str, first: dict[str, Any], who: Identity) -> dict[str, Any]:
+def _versions(store: ColumnStore, job_id: str, first: dict[str, Any], who: Identity) -> dict[str, Any]:
     job, saved = store.job(job_id), store.columns_versions(job_id)
     found = {
         "version": 0,
@@ -433,12 +417,12 @@ def _versions(store: JobStore, job_id: str, first: dict[str, Any], who: Identity
     }
 
 
-def _highest_of(store: JobStore, job_id: str, saved: list[dict[str, Any]]) -> int:
+def _highest_of(store: ColumnStore, job_id: str, saved: list[dict[str, Any]]) -> int:
     return max((_highest_id(store, job_id, one["version"]) for one in saved), default=0)
 
 
 @lru_cache(maxsize=4096)
-def _highest_id(store: JobStore, job_id: str, version: int) -> int:
+def _highest_id(store: ColumnStore, job_id: str, version: int) -> int:
     """Return the highest number of a version's columns; versions never change."""
     lines = store.columns(job_id, version).splitlines()[1:]
     return max(int(line.partition(",")[0]) for line in lines)

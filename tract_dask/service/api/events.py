@@ -7,12 +7,13 @@ from contextlib import aclosing
 from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
 from ..events import Feed, chunk, public_record
 from ..jobs.records import Job
 from ..jobs.store import JobStore
+from ..services import Served, Services
 from .models import JobId, errors
 
 router = APIRouter(tags=["events"])
@@ -46,21 +47,21 @@ Since = Annotated[
 
 
 @router.get("/events", response_class=StreamingResponse, responses=_STREAM | errors())
-def watch_all(request: Request, last_event_id: LastEventId = None, after: Since = None) -> StreamingResponse:
+def watch_all(services: Served, last_event_id: LastEventId = None, after: Since = None) -> StreamingResponse:
     """Watch all jobs.
 
     Without the number of an event it begins with the newest jobs and those that run, as they are now.
     """
-    return _stream(request, _resumed(last_event_id, after), None, _newest_jobs)
+    return _stream(services, _resumed(last_event_id, after), None, _newest_jobs)
 
 
 @router.get("/jobs/{job_id}/events", response_class=StreamingResponse, responses=_STREAM | errors(404))
 def watch_job(
-    job_id: JobId, request: Request, last_event_id: LastEventId = None, after: Since = None
+    job_id: JobId, services: Served, last_event_id: LastEventId = None, after: Since = None
 ) -> StreamingResponse:
     """Watch a job; without the number of an event it begins with the job as it is now."""
-    request.app.state.store.job(job_id)
-    return _stream(request, _resumed(last_event_id, after), job_id, lambda store: [store.job(job_id)])
+    services.store.job(job_id)
+    return _stream(services, _resumed(last_event_id, after), job_id, lambda store: [store.job(job_id)])
 
 
 def _newest_jobs(store: JobStore) -> list[Job]:
@@ -77,10 +78,10 @@ def _resumed(header: str | None, after: int | None) -> int | None:
 
 
 def _stream(
-    request: Request, after: int | None, job_id: str | None, snapshot: Callable[[JobStore], list[Job]]
+    services: Services, after: int | None, job_id: str | None, snapshot: Callable[[JobStore], list[Job]]
 ) -> StreamingResponse:
-    feed, store = request.app.state.feed, request.app.state.store
-    return StreamingResponse(_chunks(feed, store, after, job_id, snapshot), media_type="text/event-stream")
+    chunks = _chunks(services.feed, services.store, after, job_id, snapshot)
+    return StreamingResponse(chunks, media_type="text/event-stream")
 
 
 async def _chunks(

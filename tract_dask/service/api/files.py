@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from ..checks import about_movie
-from ..data_root import PAGE, Page
+from ..data_root import PAGE
+from ..services import Served
 from .models import RelativePath, Shape, errors
 
 router = APIRouter(tags=["files"])
@@ -93,7 +94,7 @@ MoviePath = Annotated[RelativePath, Query(min_length=1, description="A movie und
 
 @router.get("/files", response_model=Listing, responses=errors(400, 404))
 def list_files(
-    request: Request,
+    services: Served,
     path: FolderPath = "",
     after: Annotated[
         str, Query(max_length=600, pattern="^([01][0-9a-f]*)?$", description="``next`` of the page before.")
@@ -101,13 +102,13 @@ def list_files(
     limit: Annotated[int, Query(ge=1, le=5000, description="Entries of a page, at most.")] = PAGE,
 ) -> dict[str, Any]:
     """List a folder, page by page: folders first, then movies and other files, by name; hidden ones are left out."""
-    page: Page = request.app.state.root.listing(path, after, limit)
+    page = services.root.listing(path, after, limit)
     return {"path": path, "entries": page.entries, "next": page.next}
 
 
 @router.get("/files/about", response_model=About, responses=errors(400, 404, 503))
 async def about_file(
-    request: Request,
+    services: Served,
     path: MoviePath,
     raw_shape: Annotated[
         list[int] | None, Query(description="Of a raw file: frames, rows, columns.", min_length=3, max_length=3)
@@ -116,9 +117,8 @@ async def about_file(
     raw_offset: Annotated[int, Query(ge=0, le=2**53, description="Of a raw file: bytes to skip.")] = 0,
 ) -> dict[str, Any]:
     """Read what a movie says about itself, without its pixels."""
-    state = request.app.state
+    root = services.root
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
-    place, file = await run_in_threadpool(state.root.source, path), state.root.path / path
-    found: dict[str, Any] = await state.workshop.run(about_movie, place, declared, state.root.permit, about=file)
-    found = state.root.shown(found)
-    return found | {"path": path}
+    place, file = await run_in_threadpool(root.source, path), root.path / path
+    found = await services.workshop.run(about_movie, place, declared, root.permit, about=file)
+    return root.shown(found) | {"path": path}

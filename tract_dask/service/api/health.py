@@ -7,13 +7,14 @@ from http import HTTPStatus
 from importlib.metadata import version
 from typing import Literal
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..auth.tokens import identity
 from ..jobs.states import State
 from ..jobs.store import JobStore
+from ..services import Served
 from .models import errors
 
 router = APIRouter(tags=["health"], dependencies=[Depends(identity)])
@@ -50,13 +51,12 @@ class Health(BaseModel):
 
 
 @router.get("/health", responses=errors() | {503: {"model": Health, "description": "The service needs help."}})
-def health(request: Request, response: Response) -> Health:
+def health(services: Served, response: Response) -> Health:
     """Say whether the database, the runner and the cluster are well; 503 where jobs cannot go on without help."""
-    state = request.app.state
-    database, counts = _database(state.store)
-    runner = "ok" if state.runner.is_alive() else "its thread has ended: see the service's log, and start it again"
-    workers = len(state.runner.keeper.workers())
-    cluster = "ok" if workers or state.runner.keeper.dashboard() else "its scheduler does not answer"
+    database, counts = _database(services.store)
+    runner = "ok" if services.runner.is_alive() else "its thread has ended: see the service's log, and start it again"
+    workers = len(services.runner.keeper.workers())
+    cluster = "ok" if workers or services.runner.keeper.dashboard() else "its scheduler does not answer"
     failed = database != "ok" or runner != "ok"
     response.status_code = HTTPStatus.SERVICE_UNAVAILABLE if failed else HTTPStatus.OK
     return Health(
@@ -77,9 +77,9 @@ def health(request: Request, response: Response) -> Health:
     responses=errors()
     | {200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "Prometheus' text."}},
 )
-def metrics(request: Request) -> Response:
+def metrics(services: Served) -> Response:
     """Return the service's figures in Prometheus' text format."""
-    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE_LATEST)
+    return Response(services.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
 
 def _database(store: JobStore) -> tuple[str, dict[State, int]]:

@@ -13,6 +13,7 @@ from pydantic import (
     StringConstraints,
     WithJsonSchema,
 )
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from ..errors import ERRORS
 from ..jobs.public import EXAMPLE_JOB, JobRecord, Label, Text, plain_values
@@ -48,25 +49,24 @@ class Transition(BaseModel):
     reason: str
 
 
+_Event = Annotated[
+    int, Field(description="Number of the newest event when this was read: subscribe to what comes after it.")
+]
+
+_EXAMPLE_DETAIL = EXAMPLE_JOB | {
+    "transitions": [{"time": "2026-11-22T10:00:00.000Z", "state": "queued", "stage": "", "reason": "submitted"}],
+    "links": {"self": "/api/v1/jobs/3f9a0c12de"},
+    "event": 311,
+}
+
+
+@pydantic_dataclass(frozen=True, kw_only=True, config=ConfigDict(json_schema_extra={"example": _EXAMPLE_DETAIL}))
 class JobDetail(JobRecord):
     """A job with its history, and where the rest of it is found."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "example": EXAMPLE_JOB
-            | {
-                "transitions": [
-                    {"time": "2026-11-22T10:00:00.000Z", "state": "queued", "stage": "", "reason": "submitted"}
-                ],
-                "links": {"self": "/api/v1/jobs/3f9a0c12de"},
-                "event": 311,
-            }
-        }
-    )
-
     transitions: list[Transition]
     links: dict[str, str]
-    event: int = Field(description="Number of the newest event when this was read: subscribe to what comes after it.")
+    event: _Event
 
 
 class JobList(BaseModel):
@@ -81,7 +81,7 @@ class JobList(BaseModel):
     jobs: list[JobRecord]
     counts: dict[State, int] = Field(description="Jobs by state, of all that owner and text let through.")
     next: int | None = Field(description="What to give as ``before`` for the next page; null: this is the last.")
-    event: int = Field(description="Number of the newest event when this was read: subscribe to what comes after it.")
+    event: _Event
 
 
 class NewJob(BaseModel):

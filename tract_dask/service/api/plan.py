@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..checks import plan_job
+from ..services import Served
 from .models import RelativePath, SettingValues, Shape, errors
 from .requests import Who
 from .settings_schema import setting_rows
@@ -147,9 +148,9 @@ class WorkerList(BaseModel):
 
 
 @router.post("/plan", response_model=PlanAnswer, responses=errors(400, 404, 503))
-async def plan(asked: PlanRequest, request: Request, who: Who) -> dict[str, Any]:
+async def plan(asked: PlanRequest, services: Served, who: Who) -> dict[str, Any]:
     """Plan a job: the checks that its submission makes, what it reads and writes, and how long it takes."""
-    return await plan_job(request.app.state, who.name, asked.source, asked.settings, asked.output)
+    return await plan_job(services, who.name, asked.source, asked.settings, asked.output)
 
 
 @router.get("/settings", response_model=SettingList, responses=errors())
@@ -159,7 +160,7 @@ def list_settings() -> dict[str, Any]:
 
 
 @router.get("/workers", response_model=WorkerList, responses=errors())
-def list_workers(request: Request) -> dict[str, Any]:
+def list_workers(services: Served) -> dict[str, Any]:
     """List the workers of the cluster and what they do."""
-    keeper = request.app.state.runner.keeper
+    keeper = services.runner.keeper
     return {"workers": keeper.workers(), "dashboard": keeper.dashboard() is not None}

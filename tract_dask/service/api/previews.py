@@ -16,12 +16,16 @@ from ...settings.toml import from_dict
 from ...store.damage import METADATA
 from ...store.metadata import attributes
 from ...store.run_folder import MOVIE, SUM
+from ..data_root import DataRoot
+from ..services import Served, Services
 from ..views import pictures
 from ..views.pictures import MAX_SIDE_PX, View
 from .answers import NOT_MODIFIED, Version, kept_answer, stamp
+from .column_desk import ColumnDesk, Desk
 from .models import JobId, RelativePath, errors
+from .requests import folder_of
 
-router = APIRouter(tags=["previews"])
+router, sums = APIRouter(tags=["previews"]), APIRouter()
 
 _NUMBER = r"-?\d{1,8}(\.\d{1,12})?"
 
@@ -112,18 +116,18 @@ Gain = Annotated[MetadataSettings, Depends(declared_gain)]
 
 
 async def file_frame(
-    request: Request, path: MoviePath, raw: Raw, gain: Gain, frame: FrameNumber = 0
+    services: Served, path: MoviePath, raw: Raw, gain: Gain, frame: FrameNumber = 0
 ) -> pictures.MovieFrame:
     """Return a frame of a file."""
-    place, version = await run_in_threadpool(_movie, request, path)
-    root = request.app.state.root
+    root = services.root
+    place, version = await run_in_threadpool(_movie, root, path)
     return pictures.MovieFrame(root.path / path, place, raw, gain, root.permit, frame, version)
 
 
-async def job_frame(job_id: JobId, request: Request, frame: FrameNumber = 0) -> pictures.MovieFrame:
+async def job_frame(job_id: JobId, services: Served, frame: FrameNumber = 0) -> pictures.MovieFrame:
     """Return a frame of a job's movie."""
-    found, version = await run_in_threadpool(_job_movie, request, job_id)
-    return pictures.MovieFrame(str(found[0]), *found, request.app.state.root.permit, frame, version)
+    found, version = await run_in_threadpool(_job_movie, services, job_id)
+    return pictures.MovieFrame(str(found[0]), *found, services.root.permit, frame, version)
 
 
 FileFrame = Annotated[pictures.MovieFrame, Depends(file_frame)]
@@ -131,84 +135,66 @@ JobFrame = Annotated[pictures.MovieFrame, Depends(job_frame)]
 
 
 @router.get("/files/frame.png", response_class=Response, responses=_PICTURE)
-async def frame_picture(request: Request, frame: FileFrame, seen: Seen, said: Version = "") -> Response:
+async def frame_picture(
+    request: Request, services: Served, frame: FileFrame, seen: Seen, said: Version = ""
+) -> Response:
     """Show a part of a frame of a movie on disk, in any format, also of a converted one."""
-    return await _picture(request, frame, seen, said)
+    return await _picture(request, services, frame, seen, said)
 
 
 @router.get("/files/histogram", response_class=Response, responses=_LEVELS)
-async def frame_histogram(request: Request, frame: FileFrame, seen: Seen) -> Response:
+async def frame_histogram(request: Request, services: Served, frame: FileFrame, seen: Seen) -> Response:
     """Tell what values a frame has, as frame.png shows it with the same parameters."""
-    return await _levels(request, frame, seen)
+    return await _levels(request, services, frame, seen)
 
 
 @router.get("/jobs/{job_id}/frame.png", response_class=Response, responses=_PICTURE)
-async def job_frame_picture(request: Request, frame: JobFrame, seen: Seen, said: Version = "") -> Response:
+async def job_frame_picture(
+    request: Request, services: Served, frame: JobFrame, seen: Seen, said: Version = ""
+) -> Response:
     """Show a part of a frame of a job's movie."""
-    return await _picture(request, frame, seen, said)
+    return await _picture(request, services, frame, seen, said)
 
 
 @router.get("/jobs/{job_id}/histogram", response_class=Response, responses=_LEVELS)
-async def job_frame_histogram(request: Request, frame: JobFrame, seen: Seen) -> Response:
+async def job_frame_histogram(request: Request, services: Served, frame: JobFrame, seen: Seen) -> Response:
     """Tell what values a frame of a job's movie has, as its frame.png shows it with the same parameters."""
-    return await _levels(request, frame, seen)
+    return await _levels(request, services, frame, seen)
 
 
-@router.get("/jobs/{job_id}/sum.png", response_class=Response, responses=_PICTURE)
-async def sum_picture(job_id: JobId, request: Request, seen: Seen, said: Version = "") -> Response:
+@sums.get("/jobs/{job_id}/sum.png", response_class=Response, responses=_PICTURE)
+async def sum_picture(job_id: JobId, request: Request, desk: Desk, seen: Seen, said: Version = "") -> Response:
     """Show a part of a job's drift-corrected summed image, in counts of one frame."""
-    folder, version = await run_in_threadpool(_sum, request, job_id)
+    folder, version = await run_in_threadpool(_sum, desk, job_id)
     return await kept_answer(
-        request, "image/png", version, pictures.sum_png, folder, seen, version, about=folder, said=said
+        request, desk.pool, "image/png", version, pictures.sum_png, folder, seen, version, about=folder, said=said
     )
 
 
-@router.get(
-    "/jobs/{job_id}/sum",
-    response_class=Response,
-    responses=_LEVELS,
-)
-async def sum_about(job_id: JobId, request: Request, seen: Seen) -> Response:
+@sums.get("/jobs/{job_id}/sum", response_class=Response, responses=_LEVELS)
+async def sum_about(job_id: JobId, request: Request, desk: Desk, seen: Seen) -> Response:
     """Tell the size of a job's summed image, and what values it has."""
-    folder, version = await run_in_threadpool(_sum, request, job_id)
+    folder, version = await run_in_threadpool(_sum, desk, job_id)
     return await kept_answer(
-        request, "application/json", version, pictures.sum_levels, folder, seen, version, about=folder
+        request, desk.pool, "application/json", version, pictures.sum_levels, folder, seen, version, about=folder
     )
 
 
-def folder_of(request: Request, job_id: str, *names: str) -> Path:
-    """Return the folder of a job's output.
-
-    Parameters
-    ----------
-    names
-        What is about to be read there.
-
-    Raises
-    ------
-    OutsideError
-        Where a link in it leads out of the data root.
-    """
-    state = request.app.state
-    output = state.store.job(job_id).output
-    for name in names:
-        state.root.store(f"{output}/{name}")
-    found: Path = state.root.resolve(output, must_exist=False)
-    return found
+router.include_router(sums)
 
 
-async def _picture(request: Request, frame: pictures.MovieFrame, seen: View, said: str) -> Response:
-    make = pictures.source_png
-    return await kept_answer(request, "image/png", frame.stamp, make, frame, seen, about=frame.named, said=said)
+async def _picture(request: Request, services: Services, frame: pictures.MovieFrame, seen: View, said: str) -> Response:
+    pool, make = services.workshop, pictures.source_png
+    return await kept_answer(request, pool, "image/png", frame.stamp, make, frame, seen, about=frame.named, said=said)
 
 
-async def _levels(request: Request, frame: pictures.MovieFrame, seen: View) -> Response:
-    make = pictures.source_levels
-    return await kept_answer(request, "application/json", frame.stamp, make, frame, seen, about=frame.named)
+async def _levels(request: Request, services: Services, frame: pictures.MovieFrame, seen: View) -> Response:
+    pool, make = services.workshop, pictures.source_levels
+    return await kept_answer(request, pool, "application/json", frame.stamp, make, frame, seen, about=frame.named)
 
 
-def _movie(request: Request, path: str) -> tuple[str | FileList, str]:
-    place: str | FileList = request.app.state.root.source(path)
+def _movie(root: DataRoot, path: str) -> tuple[str | FileList, str]:
+    place = root.source(path)
     return place, _version(place)
 
 
@@ -219,17 +205,16 @@ def _version(place: str | FileList) -> str:
     return stamp(outer / METADATA if outer.suffix == ".zarr" else outer)
 
 
-def _job_movie(request: Request, job_id: str) -> tuple[tuple[str | FileList, SourceSettings, MetadataSettings], str]:
+def _job_movie(services: Services, job_id: str) -> tuple[tuple[str | FileList, SourceSettings, MetadataSettings], str]:
     """Return where the movie of a job is, converted if it is already, and its version."""
-    state = request.app.state
-    job, converted = state.store.job(job_id), folder_of(request, job_id, MOVIE) / MOVIE
-    place = str(converted) if attributes(converted).get("complete") else state.root.source(job.source)
+    job, converted = services.store.job(job_id), folder_of(services, job_id, MOVIE) / MOVIE
+    place = str(converted) if attributes(converted).get("complete") else services.root.source(job.source)
     source = from_dict(SourceSettings, job.settings.get("source", {}))
     metadata = from_dict(MetadataSettings, job.settings.get("metadata", {}))
     return (place, source, metadata), _version(place)
 
 
-def _sum(request: Request, job_id: str) -> tuple[Path, str]:
+def _sum(desk: ColumnDesk, job_id: str) -> tuple[Path, str]:
     """Return the folder of a job, and the version of its summed image.
 
     Raises
@@ -237,7 +222,7 @@ def _sum(request: Request, job_id: str) -> tuple[Path, str]:
     MissingStoreError
         Where there is none yet.
     """
-    folder = folder_of(request, job_id, SUM)
+    folder = desk.folder(job_id)
     about = folder / SUM / METADATA
     if not about.is_file():
         raise MissingStoreError(

@@ -1,20 +1,22 @@
-"""Who asks, and whether the job is theirs to change: the dependencies of routes."""
+"""Who asks, whether the job is theirs to change, and where its files are."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends
 
 from ..auth.tokens import Identity, identity, may_change
 from ..jobs.records import Job
+from ..services import Served, Services
 from .models import JobId
 
 Who = Annotated[Identity, Depends(identity)]
 """Who asks."""
 
 
-def own_job(job_id: JobId, request: Request, who: Who) -> Job:
+def own_job(job_id: JobId, services: Served, who: Who) -> Job:
     """Return the job, which who asks owns, or may change as an admin.
 
     Raises
@@ -24,10 +26,29 @@ def own_job(job_id: JobId, request: Request, who: Who) -> Job:
     ForbiddenError
         Where it is someone else's.
     """
-    job: Job = request.app.state.store.job(job_id)
+    job = services.store.job(job_id)
     may_change(who, job)
     return job
 
 
 OwnJob = Annotated[Job, Depends(own_job)]
 """The job of a route that changes it: every such route takes it in this way."""
+
+
+def folder_of(services: Services, job_id: str, *names: str) -> Path:
+    """Return the folder of a job's output.
+
+    Parameters
+    ----------
+    names
+        What is about to be read there.
+
+    Raises
+    ------
+    OutsideError
+        Where a link in it leads out of the data root.
+    """
+    output = services.store.job(job_id).output
+    for name in names:
+        services.root.store(f"{output}/{name}")
+    return services.root.resolve(output, must_exist=False)

@@ -12,18 +12,16 @@ import re
 import secrets
 import sqlite3
 import time
-from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from threading import Lock
 from typing import Literal
 
 from starlette.requests import HTTPConnection
 
 from ...errors import InputError
 from ..config import ServiceConfig
-from ..errors import ForbiddenError, NoTokenError, TooManyError
+from ..errors import ForbiddenError, NoTokenError
 from ..jobs.records import Job
 from ..jobs.store import JobStore
 
@@ -191,46 +189,6 @@ class Access:
             JOIN tokens ON tokens.id = sessions.token_id
             WHERE sessions.id = ? AND sessions.expires > ? AND tokens.revoked IS NULL"""
         return _proven(self._db.execute(query, (identifier, time.time())).fetchone(), secret)
-
-
-class Attempts:
-    """Failed attempts to log in, so many within a minute from one address.
-
-    Parameters
-    ----------
-    limit
-        Failures of an address within ``window_s`` seconds, after which it has to wait.
-    addresses
-        How many are remembered; those that failed longest ago go first.
-    """
-
-    def __init__(self, limit: int = 10, window_s: float = 60.0, addresses: int = 4096) -> None:
-        self._limit, self._window_s, self._addresses = limit, window_s, addresses
-        self._failed: OrderedDict[str, deque[float]] = OrderedDict()
-        self._lock = Lock()
-
-    def check(self, address: str) -> None:
-        """Refuse an address that failed too often.
-
-        Raises
-        ------
-        TooManyError
-            Where it has to wait.
-        """
-        with self._lock:
-            times = self._failed.get(address, deque())
-            while times and times[0] < time.monotonic() - self._window_s:
-                times.popleft()
-            if len(times) >= self._limit:
-                raise TooManyError("too many attempts to log in failed", remedy="Wait for a minute")
-
-    def failed(self, address: str) -> None:
-        """Count a failure."""
-        with self._lock:
-            self._failed.setdefault(address, deque(maxlen=self._limit)).append(time.monotonic())
-            self._failed.move_to_end(address)
-            while len(self._failed) > self._addresses:
-                self._failed.popitem(last=False)
 
 
 def identity(request: HTTPConnection) -> Identity:

@@ -13,9 +13,11 @@ from pydantic import (
     ConfigDict,
     Field,
     StringConstraints,
+    model_validator,
 )
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from .states import State
+from .records import Job, PublicJob
 
 MAX_ITEMS, MAX_DEPTH, MAX_TEXT = 20_000, 6, 4096
 """Values in the settings of a request, how deep they may be nested, and characters of one text."""
@@ -182,29 +184,14 @@ class OutcomeRecord(BaseModel):
     seconds: dict[str, float] | None = Field(None, description="Time of every stage that worked, in s.")
 
 
-class JobRecord(BaseModel):
+@pydantic_dataclass(frozen=True, kw_only=True, config=ConfigDict(json_schema_extra={"example": EXAMPLE_JOB}))
+class JobRecord(PublicJob):
     """A job."""
 
-    model_config = ConfigDict(from_attributes=True, json_schema_extra={"example": EXAMPLE_JOB})
+    progress: ProgressRecord  # type: ignore[assignment]  # over the wire with all its defaults
+    outcome: OutcomeRecord  # type: ignore[assignment]
 
-    id: str = Field(description="10 hexadecimal digits.")
-    number: int = Field(description="Order of submission.")
-    label: str
-    owner: str
-    source: str = Field(description="The movie, relative to the data root.")
-    output: str = Field(description="The folder of its results, relative to the data root.")
-    settings: dict[str, Any] = Field(description="By group and name; what is not here has its default.")
-    curate: bool = Field(description="Whether it stops after the summed image, for columns to be edited by hand.")
-    state: State
-    reason: str = Field(description="Why it is in this state, where that needs saying.")
-    stage: str
-    created: str = Field(description="UTC, ISO 8601.")
-    started: str | None
-    ended: str | None
-    attempts: int
-    progress: ProgressRecord
-    outcome: OutcomeRecord
-    columns_version: int | None = Field(
-        description="Version of the columns that is fitted; 0: those found automatically; null: none chosen yet."
-    )
-    not_before: str | None = Field(None, description="When a job whose cluster was lost is tried again.")
+    @model_validator(mode="before")
+    @classmethod
+    def _of_job(cls, value: Any) -> Any:
+        return vars(value) if isinstance(value, Job) else value

@@ -1,9 +1,12 @@
-"""Times as the store writes them: UTC, ISO 8601 with milliseconds, so that the texts sort as the times do."""
+"""A job, its events and its deletion, and times as the store writes them.
+
+Times are UTC, ISO 8601 with milliseconds, so that the texts sort as the times do.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -35,56 +38,62 @@ class ConflictError(InputError):
     """The job's state does not allow this."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """A job as it stands.
+@dataclass(frozen=True, kw_only=True)
+class PublicJob:
+    """A job as the API and its clients know it; the one list of its fields.
 
-    Attributes
-    ----------
-    number
-        Order of submission.
-    source, output
-        Relative to the data root, with "/" between folders.
-    settings
-        Nested, as :func:`tract_dask.settings.to_dict` returns them; without the cluster.
-    curate
-        Whether it stops for columns after the summed image.
-    stage
-        The stage that it is in, or ended in: one of :data:`tract_dask.progress.STAGES` or ``report``; or empty.
-    created, started, ended
-        UTC, ISO 8601 with milliseconds; ``started`` for the first time.
-    attempts
-        How often it has been started.
-    progress, outcome
-        As :class:`tract_dask.service.runner.timeline.Timeline` and :class:`tract_dask.run.pipeline.RunOutcome` tell
-        them.
-    columns_version
-        Of the columns that are fitted; 0: those found automatically; None: nobody has chosen.
-    not_before
-        When a job whose cluster was lost is tried again.
-    lost_tries
-        How often its cluster was lost since it last got any further.
+    Descriptions are those of the API's document.
     """
 
-    id: str
-    number: int
+    id: str = field(metadata={"description": "10 hexadecimal digits."})
+    number: int = field(metadata={"description": "Order of submission."})
     label: str
     owner: str
-    source: str
-    output: str
-    settings: dict[str, Any]
-    curate: bool
+    source: str = field(metadata={"description": "The movie, relative to the data root."})
+    output: str = field(metadata={"description": "The folder of its results, relative to the data root."})
+    settings: dict[str, Any] = field(metadata={"description": "By group and name; what is not here has its default."})
+    curate: bool = field(
+        metadata={"description": "Whether it stops after the summed image, for columns to be edited by hand."}
+    )
     state: State
-    reason: str
+    reason: str = field(metadata={"description": "Why it is in this state, where that needs saying."})
     stage: str
-    created: str
+    created: str = field(metadata={"description": "UTC, ISO 8601."})
     started: str | None
     ended: str | None
     attempts: int
     progress: dict[str, Any]
     outcome: dict[str, Any]
-    columns_version: int | None
-    not_before: str | None
+    columns_version: int | None = field(
+        metadata={
+            "description": "Version of the columns that is fitted; 0: those found automatically; "
+            "null: none chosen yet."
+        }
+    )
+    not_before: str | None = field(
+        default=None, metadata={"description": "When a job whose cluster was lost is tried again."}
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(PublicJob):
+    """A job as it stands in the store.
+
+    Attributes
+    ----------
+    settings
+        Nested, as :func:`tract_dask.settings.to_dict` returns them; without the cluster.
+    stage
+        The stage that it is in, or ended in: one of :data:`tract_dask.progress.STAGES` or ``report``; or empty.
+    created, started, ended
+        With milliseconds; ``started`` for the first time.
+    progress, outcome
+        As :class:`tract_dask.service.runner.timeline.Timeline` and :class:`tract_dask.run.pipeline.RunOutcome` tell
+        them.
+    lost_tries
+        How often its cluster was lost since it last got any further.
+    """
+
     lost_tries: int
 
     def to_record(self) -> dict[str, Any]:

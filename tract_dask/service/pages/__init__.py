@@ -12,6 +12,7 @@ from fastapi.templating import Jinja2Templates
 
 from ...web.bundle import STATIC
 from ..auth.tokens import IDENTITY, identity
+from ..services import services
 
 _FOLDER = Path(__file__).parent
 
@@ -28,13 +29,13 @@ def error_page(request: Request, problem: dict[str, str], status: int) -> HTMLRe
 
 def _page(request: Request, name: str, **values: Any) -> HTMLResponse:
     """Return a page; ``here`` marks it in the navigation, ``who`` looks at it."""
-    about = {"here": name, "who": identity(request), "may_log_out": request.app.state.access.demanded}
+    about = {"here": name, "who": identity(request), "may_log_out": services(request).access.demanded}
     return templates.TemplateResponse(request, f"{name}.html", about | values)
 
 
 def _job_page(request: Request, name: str, job_id: str) -> HTMLResponse:
     """Return a page about a job."""
-    return _page(request, name, job=request.app.state.store.job(job_id))
+    return _page(request, name, job=services(request).store.job(job_id))
 
 
 @pages.get("/")

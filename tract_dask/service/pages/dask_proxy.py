@@ -16,7 +16,6 @@ from contextlib import suppress
 from http import HTTPStatus
 from urllib.parse import quote, unquote, urlsplit
 
-import httpcore  # noqa: F401  httpx would import it with its first client, while other threads import h11 and anyio
 import httpx
 import websockets
 from fastapi import APIRouter, Request, WebSocket
@@ -26,7 +25,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Scope
 from starlette.websockets import WebSocketDisconnect
 
-from ...cluster.tls import web_context
+from ..services import Served
 from . import templates
 
 PREFIX = "/dask"
@@ -70,38 +69,12 @@ _FILE = re.compile(r"[\w@+-][\w@+.-]*", re.ASCII)
 _TABLES = frozenset(("main", "worker", "task", "call-stack", "call-stacks", "logs"))
 _SOCKET = "ws"
 
-_TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 _MAX_MESSAGE_BYTES = 64 << 20
 _GOING_AWAY, _NO_DASHBOARD = 1001, 1013
 
 log = logging.getLogger(__name__)
 
 dashboard = APIRouter(include_in_schema=False)
-
-
-class Upstream:
-    """Connections to the dashboard, shared by all requests; opened with the first.
-
-    Parameters
-    ----------
-    certificates
-        Folder of those that the dashboard may use (setting tls).
-    """
-
-    def __init__(self, certificates: str | None = None) -> None:
-        self.context = web_context(certificates)
-        self._client: httpx.AsyncClient | None = None
-
-    async def get(self, url: str, method: str, headers: dict[str, str]) -> httpx.Response:
-        """Return a response whose body is still to come."""
-        if self._client is None:
-            self._client = httpx.AsyncClient(timeout=_TIMEOUT, trust_env=False, verify=self.context or True)
-        return await self._client.send(self._client.build_request(method, url, headers=headers), stream=True)
-
-    async def close(self) -> None:
-        """Close the connections."""
-        if self._client is not None:
-            await self._client.aclose()
 
 
 @dashboard.get(PREFIX)
@@ -112,16 +85,16 @@ def home() -> Response:
 
 
 @dashboard.api_route(PREFIX + "/{path:path}", methods=["GET", "HEAD"])
-async def page(request: Request, path: str) -> Response:
+async def page(request: Request, services: Served, path: str) -> Response:
     """Pass a page of the dashboard, or a part of one, on."""
-    address, parts = request.app.state.runner.keeper.dashboard(), canonical(request.scope)
+    address, parts = services.runner.keeper.dashboard(), canonical(request.scope)
     if not may_pass(parts):
         raise HTTPException(HTTPStatus.NOT_FOUND)
     if address is None:
         return _missing(request)
     headers = {name: request.headers[name] for name in _SENT_ON if name in request.headers}
     try:
-        found = await request.app.state.upstream.get(_url(address, parts, request.scope), request.method, headers)
+        found = await services.upstream.get(_url(address, parts, request.scope), request.method, headers)
     except httpx.HTTPError as error:
         log.info("the dashboard at %s does not answer: %s", address, error or type(error).__name__)
         return _missing(request)
@@ -133,9 +106,9 @@ async def page(request: Request, path: str) -> Response:
 
 
 @dashboard.websocket(PREFIX + "/{path:path}")
-async def socket(client: WebSocket, path: str) -> None:
+async def socket(client: WebSocket, services: Served, path: str) -> None:
     """Pass the messages of a page's socket on, both ways."""
-    address, parts = client.app.state.runner.keeper.dashboard(), canonical(client.scope)
+    address, parts = services.runner.keeper.dashboard(), canonical(client.scope)
     if address is None or not (parts[-1:] == (_SOCKET,) and _is_page(parts[:-1])):
         await client.close(_NO_DASHBOARD)
         return
@@ -144,7 +117,7 @@ async def socket(client: WebSocket, path: str) -> None:
     try:
         upstream = await websockets.connect(
             url.replace("http", "ws", 1),
-            ssl=client.app.state.upstream.context if url.startswith("https") else None,
+            ssl=services.upstream.context if url.startswith("https") else None,
             origin=websockets.Origin(address.rstrip("/")),
             subprotocols=protocols or None,
             max_size=_MAX_MESSAGE_BYTES,

@@ -8,38 +8,32 @@ from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from ..auth.gate import LOGIN, cookie_name, read_cookie
-from ..auth.tokens import Access, Attempts
-from ..errors import TooManyError
+from ..services import Served
 from . import templates
 
 login = APIRouter(include_in_schema=False)
-_attempts = Attempts()
 
 
 @login.get(LOGIN)
-def show_form(request: Request, to: Annotated[str, Query(alias="next")] = "/") -> Response:
+def show_form(request: Request, services: Served, to: Annotated[str, Query(alias="next")] = "/") -> Response:
     """Ask for a token; where none is demanded, go on."""
-    if not request.app.state.access.demanded:
+    if not services.access.demanded:
         return RedirectResponse("/", 303)
     return _form(request, to)
 
 
 @login.post(LOGIN)
 def log_in(
-    request: Request, token: Annotated[str, Form(max_length=256)] = "", to: Annotated[str, Form(alias="next")] = "/"
+    request: Request,
+    services: Served,
+    token: Annotated[str, Form(max_length=256)] = "",
+    to: Annotated[str, Form(alias="next")] = "/",
 ) -> Response:
     """Open a session for the holder of a token."""
-    access: Access = request.app.state.access
-    address = request.client.host if request.client else ""
-    try:
-        _attempts.check(address)
-    except TooManyError as error:
-        return _form(request, to, str(error), 429)
-    session = access.open_session(token.strip())
+    session = services.access.open_session(token.strip())
     if session is None:
-        _attempts.failed(address)
         return _form(request, to, "This token is not valid.", 401)
-    config = request.app.state.config
+    config = services.config
     response = RedirectResponse(_local(to), 303)
     response.set_cookie(
         cookie_name(request.scope, config),
@@ -53,10 +47,10 @@ def log_in(
 
 
 @login.post("/logout")
-def log_out(request: Request) -> Response:
+def log_out(request: Request, services: Served) -> Response:
     """End the session."""
-    name = cookie_name(request.scope, request.app.state.config)
-    request.app.state.access.close_session(read_cookie(request.headers, name))
+    name = cookie_name(request.scope, services.config)
+    services.access.close_session(read_cookie(request.headers, name))
     response = RedirectResponse(LOGIN, 303)
     response.delete_cookie(name, secure=request.url.scheme == "https", httponly=True, samesite="strict")
     return response

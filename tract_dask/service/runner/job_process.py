@@ -23,9 +23,9 @@ from ...progress import RunState
 from ...readers.listing import FileList
 from ...settings.cluster import ClusterSettings
 from ...settings.toml import to_dict
-from ..checks import inside, job_settings
 from ..crashes import crash_of, crashed
 from ..data_root import DataRoot
+from ..job_settings import inside
 from ..jobs.records import Job, utc_now
 from ..jobs.states import AFTER_RUN, State
 from ..jobs.store import JobStore
@@ -197,7 +197,7 @@ class Attempt(Thread):
             "root": str(self._root.path),
             "closed": list(map(str, self._root.permit.closed)),
             "mark": asdict(self._mark),
-            "settings": to_dict(inside(self._root, job_settings(job.settings))),
+            "settings": inside(self._root, job.settings),
             "columns": columns,
             "until": "columns" if job.curate and version is None else None,
             "stages": job.progress.get("stages", {}),
