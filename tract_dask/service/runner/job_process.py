@@ -100,7 +100,8 @@ def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stoppi
         return Ending(State.FAILED, said.error)
     if not said.error and (sign := crash_of(code)):
         return Ending(State.FAILED, str(crashed(job.source, sign)))
-    return after_loss(job, said.error or f"the job's process has ended: {how_ended(code)}", progressed=said.shards > 0)
+    why = said.error or f"the job's process has ended: {how_ended(code)}"
+    return after_loss(job, why, progressed=said.shards > 0)
 
 
 def after_loss(job: Job, reason: str, *, progressed: bool) -> Ending:
