@@ -25,7 +25,6 @@ from itertools import count
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Semaphore, Thread
-from time import monotonic
 from traceback import format_exc
 from typing import Any, TypeVar
 
@@ -53,10 +52,6 @@ class WorkshopError(ClusterError):
     """The pool is full, or a task took too long, or its worker died twice."""
 
 
-class _LateError(Exception):
-    """The worker did not answer in time."""
-
-
 class _LostWorkerError(Exception):
     """The worker died under its task; with its exit code."""
 
@@ -82,6 +77,18 @@ class _Task:
     @property
     def name(self) -> str:
         return self.about or getattr(self.function, "__name__", "task")
+
+    def late(self) -> TractError:
+        """Return the error for a worker that did not answer in time."""
+        if self.about:
+            return unending(self.about, self.timeout_s)
+        remedy = "Ask for less, or try again when the machine has less to do"
+        return WorkshopError("this takes too long", self.name, f"at most {self.timeout_s:g} s", "more", remedy)
+
+    def killed(self) -> WorkshopError:
+        """Return the error for workers that were killed."""
+        remedy = "Try again; if it dies again, the machine may lack memory"
+        return WorkshopError("the process that did this died", self.name, remedy=remedy)
 
 
 class Workshop:
@@ -244,14 +251,11 @@ class _Bench:
 
     def _do(self, task: _Task) -> Any:
         seat = self._free.pop()
-        began = monotonic()
         try:
             return self._tried(seat, task)
         except _LostWorkerError as lost:
             sign = crash_of(lost.args[0])
-            raise (crashed(task.about, sign) if sign and task.about else _killed(task)) from None
-        except _LateError:
-            raise (unending(task.about, task.timeout_s) if task.about else _late(task, began)) from None
+            raise (crashed(task.about, sign) if sign and task.about else task.killed()) from None
         finally:
             self._free.append(seat)
 
@@ -272,21 +276,6 @@ class _Bench:
                 seat.end()
 
 
-def _killed(task: _Task) -> WorkshopError:
-    remedy = "Try again; if it dies again, the machine may lack memory"
-    return WorkshopError("the process that did this died", task.name, remedy=remedy)
-
-
-def _late(task: _Task, began: float) -> WorkshopError:
-    return WorkshopError(
-        "this takes too long",
-        task.name,
-        f"at most {task.timeout_s:g} s",
-        f"{monotonic() - began:.0f} s",
-        "Ask for less, or try again when the machine has less to do",
-    )
-
-
 class _Seat:
     """The place of one worker: it has one when it needs one, and in time another."""
 
@@ -304,7 +293,7 @@ class _Seat:
             self._change()
         try:
             value, tired = self.start().do(task)
-        except (_LostWorkerError, _LateError, ExhaustedError, WorkshopError):
+        except (_LostWorkerError, CrashError, ExhaustedError, WorkshopError):
             self._change()
             raise
         if tired and self._hiring.tasks == 1:
@@ -342,9 +331,11 @@ class _Worker:
     def do(self, task: _Task) -> tuple[Any, bool]:
         """Return what the function returns, and whether the worker should be replaced."""
         try:
-            self._greet()
+            if not self._greeted:
+                self._answer(_START_S, _unstarted())
+                self._greeted = True
             self._pipe.send((task.function, task.args))
-            error, value, tired = self._answer(task.timeout_s)
+            error, value, tired = self._answer(task.timeout_s, task.late())
         except (EOFError, OSError) as lost:
             self._process.join(_END_S)
             raise _LostWorkerError(self._process.exitcode) from lost
@@ -354,23 +345,9 @@ class _Worker:
             raise error
         return pickle.loads(value), tired
 
-    def _greet(self) -> None:
-        if self._greeted:
-            return
-        try:
-            self._answer(_START_S)
-        except _LateError:
-            raise WorkshopError(
-                "the process that was to do this does not start",
-                "workshop",
-                f"at most {_START_S:g} s",
-                remedy="Try again when the machine has less to do",
-            ) from None
-        self._greeted = True
-
-    def _answer(self, timeout_s: float) -> Any:
+    def _answer(self, timeout_s: float, late: TractError) -> Any:
         if not self._pipe.poll(timeout_s):
-            raise _LateError
+            raise late
         return self._pipe.recv()
 
     def end(self) -> None:
@@ -378,6 +355,11 @@ class _Worker:
         self._process.join(_END_S)  # one that waits for a dead disk cannot be killed before that answers
         with suppress(OSError):
             self._pipe.close()
+
+
+def _unstarted() -> WorkshopError:
+    what, remedy = "the process that was to do this does not start", "Try again when the machine has less to do"
+    return WorkshopError(what, "workshop", f"at most {_START_S:g} s", remedy=remedy)
 
 
 def _work(pipe: Connection, hiring: _Hiring) -> None:
