@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tract_dask.readers import READERS
-from tract_dask.service.process_pool import _private
+from tract_dask.service.process_pool import own_memory
 from tract_dask.store.columns import column_dataset
 
 
@@ -27,9 +27,9 @@ def starve(path: Path, *_: object):
 
 def reserved() -> int:
     """Return the bytes of private memory that a table of one column takes, with the libraries that it needs."""
-    before = _private()
+    before = own_memory("VmData")
     column_dataset([[1.0, 2.0]])
-    return _private() - before
+    return own_memory("VmData") - before
 
 
 if multiprocessing.parent_process() is not None:  # not where the tests are collected

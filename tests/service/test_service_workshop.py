@@ -4,10 +4,13 @@ import asyncio
 import math
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from tract_dask.errors import SettingsError
@@ -84,6 +87,23 @@ def test_a_worker_is_replaced_after_so_many_tasks():
 def test_long_tasks_have_a_process_each(workshop):
     pids = [asyncio.run(workshop.run_long(os.getpid)) for _ in range(2)]
     assert len({*pids, os.getpid(), asked(workshop, os.getpid)}) == 4
+
+
+SERVICE = """
+import asyncio, os, time
+from tract_dask.service.process_pool import Workshop
+workshop = Workshop(1, imported=())
+print(asyncio.run(workshop.run(os.getpid)), flush=True)
+asyncio.run(workshop.run(time.sleep, 600))
+"""
+
+
+def test_a_worker_ends_with_a_killed_service_whatever_it_is_at():
+    with subprocess.Popen([sys.executable, "-c", SERVICE], stdout=subprocess.PIPE, text=True) as service:
+        worker = psutil.Process(int(service.stdout.readline()))
+        time.sleep(0.2)  # it is given its task
+        service.kill()
+    worker.wait(10)
 
 
 def test_what_does_not_fit_is_refused(workshop):

@@ -16,6 +16,8 @@ from typing import Any
 from distributed import Client, Status
 from distributed.diagnostics.plugin import NannyPlugin
 
+from .supervised import how_ended
+
 MODULE = __name__
 """What nannies load."""
 
@@ -50,13 +52,7 @@ class Death:
     def __str__(self) -> str:
         if self.out_of_memory:
             return "it took more memory than its limit, and was ended"
-        if self.code is None:
-            return "the cause is unknown"
-        if self.code >= 0:
-            return f"exit code {self.code}"
-        if -self.code == signal.SIGKILL:
-            return "SIGKILL, as the system sends it where memory runs out"
-        return signal.Signals(-self.code).name
+        return "the cause is unknown" if self.code is None else how_ended(self.code)
 
 
 class NoteDeaths(NannyPlugin):

@@ -24,9 +24,7 @@ from importlib import import_module
 from itertools import count
 from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import LifoQueue
-from threading import Lock
-from time import monotonic
+from threading import Semaphore, Thread
 from traceback import format_exc
 from typing import Any, TypeVar
 
@@ -54,16 +52,8 @@ class WorkshopError(ClusterError):
     """The pool is full, or a task took too long, or its worker died twice."""
 
 
-class _LateError(Exception):
-    """The worker did not answer in time."""
-
-
 class _LostWorkerError(Exception):
-    """The worker died under its task."""
-
-    def __init__(self, code: int | None) -> None:
-        super().__init__(code)
-        self.code = code
+    """The worker died under its task; with its exit code."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +77,18 @@ class _Task:
     @property
     def name(self) -> str:
         return self.about or getattr(self.function, "__name__", "task")
+
+    def late(self) -> TractError:
+        """Return the error for a worker that did not answer in time."""
+        if self.about:
+            return unending(self.about, self.timeout_s)
+        remedy = "Ask for less, or try again when the machine has less to do"
+        return WorkshopError("this takes too long", self.name, f"at most {self.timeout_s:g} s", "more", remedy)
+
+    def killed(self) -> WorkshopError:
+        """Return the error for workers that were killed."""
+        remedy = "Try again; if it dies again, the machine may lack memory"
+        return WorkshopError("the process that did this died", self.name, remedy=remedy)
 
 
 class Workshop:
@@ -225,48 +227,37 @@ class _Bench:
 
     def __init__(self, workers: int, places: int, hiring: _Hiring) -> None:
         self._limit, self._closed = workers + places, False
-        self._lock, self._here = Lock(), 0
+        self._room = Semaphore(self._limit)
         self._threads = ThreadPoolExecutor(workers, "workshop")
-        self._seats: LifoQueue[_Seat] = LifoQueue()
         self._all = [_Seat(hiring) for _ in range(workers)]
-        for seat in reversed(self._all):
-            self._seats.put(seat)
+        self._free = self._all[::-1]  # as many as threads; the one that was used last is warm
 
     def start(self) -> None:
         for seat in self._all:
             seat.start()
 
     async def run(self, task: _Task) -> Any:
-        with self._lock:
-            if self._here >= self._limit:
-                raise WorkshopError(
-                    "the service has too much to do",
-                    "workshop",
-                    f"at most {self._limit} tasks at a time",
-                    f"{self._here + 1}",
-                    "Try again in a few seconds",
-                )
-            self._here += 1
+        if not self._room.acquire(blocking=False):
+            raise WorkshopError(
+                "the service has too much to do",
+                "workshop",
+                f"at most {self._limit} tasks at a time",
+                f"{self._limit + 1}",
+                "Try again in a few seconds",
+            )
         future = self._threads.submit(self._do, task)
-        future.add_done_callback(self._left)
+        future.add_done_callback(lambda _: self._room.release())
         return await asyncio.wrap_future(future)
 
-    def _left(self, _: object) -> None:
-        with self._lock:
-            self._here -= 1
-
     def _do(self, task: _Task) -> Any:
-        seat = self._seats.get()
-        began = monotonic()
+        seat = self._free.pop()
         try:
             return self._tried(seat, task)
         except _LostWorkerError as lost:
-            sign = crash_of(lost.code)
-            raise (crashed(task.about, sign) if sign and task.about else _killed(task)) from None
-        except _LateError:
-            raise (unending(task.about, task.timeout_s) if task.about else _late(task, began)) from None
+            sign = crash_of(lost.args[0])
+            raise (crashed(task.about, sign) if sign and task.about else task.killed()) from None
         finally:
-            self._seats.put(seat)
+            self._free.append(seat)
 
     def _tried(self, seat: _Seat, task: _Task) -> Any:
         try:
@@ -285,21 +276,6 @@ class _Bench:
                 seat.end()
 
 
-def _killed(task: _Task) -> WorkshopError:
-    remedy = "Try again; if it dies again, the machine may lack memory"
-    return WorkshopError("the process that did this died", task.name, remedy=remedy)
-
-
-def _late(task: _Task, began: float) -> WorkshopError:
-    return WorkshopError(
-        "this takes too long",
-        task.name,
-        f"at most {task.timeout_s:g} s",
-        f"{monotonic() - began:.0f} s",
-        "Ask for less, or try again when the machine has less to do",
-    )
-
-
 class _Seat:
     """The place of one worker: it has one when it needs one, and in time another."""
 
@@ -308,19 +284,16 @@ class _Seat:
         self._worker: _Worker | None = None
         self._successor: _Worker | None = None
 
-    def start(self) -> None:
-        if self._worker is None:
-            self._worker = _Worker(self._hiring)
+    def start(self) -> _Worker:
+        self._worker = self._worker or _Worker(self._hiring)
+        return self._worker
 
     def do(self, task: _Task) -> Any:
         if self._successor is not None and (self._worker is None or self._successor.ready):
             self._change()
-        self.start()
-        worker = self._worker
-        assert worker is not None
         try:
-            value, tired = worker.do(task)
-        except (_LostWorkerError, _LateError, ExhaustedError, WorkshopError):
+            value, tired = self.start().do(task)
+        except (_LostWorkerError, CrashError, ExhaustedError, WorkshopError):
             self._change()
             raise
         if tired and self._hiring.tasks == 1:
@@ -358,9 +331,11 @@ class _Worker:
     def do(self, task: _Task) -> tuple[Any, bool]:
         """Return what the function returns, and whether the worker should be replaced."""
         try:
-            self._greet()
+            if not self._greeted:
+                self._answer(_START_S, _unstarted())
+                self._greeted = True
             self._pipe.send((task.function, task.args))
-            error, value, tired = self._answer(task.timeout_s)
+            error, value, tired = self._answer(task.timeout_s, task.late())
         except (EOFError, OSError) as lost:
             self._process.join(_END_S)
             raise _LostWorkerError(self._process.exitcode) from lost
@@ -370,23 +345,9 @@ class _Worker:
             raise error
         return pickle.loads(value), tired
 
-    def _greet(self) -> None:
-        if self._greeted:
-            return
-        try:
-            self._answer(_START_S)
-        except _LateError:
-            raise WorkshopError(
-                "the process that was to do this does not start",
-                "workshop",
-                f"at most {_START_S:g} s",
-                remedy="Try again when the machine has less to do",
-            ) from None
-        self._greeted = True
-
-    def _answer(self, timeout_s: float) -> Any:
+    def _answer(self, timeout_s: float, late: TractError) -> Any:
         if not self._pipe.poll(timeout_s):
-            raise _LateError
+            raise late
         return self._pipe.recv()
 
     def end(self) -> None:
@@ -396,12 +357,17 @@ class _Worker:
             self._pipe.close()
 
 
+def _unstarted() -> WorkshopError:
+    what, remedy = "the process that was to do this does not start", "Try again when the machine has less to do"
+    return WorkshopError(what, "workshop", f"at most {_START_S:g} s", remedy=remedy)
+
+
 def _work(pipe: Connection, hiring: _Hiring) -> None:
     """Do what comes through the pipe until its other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to answer
-    os.environ.update(
-        dict.fromkeys(THREAD_VARIABLES, "1"), ARROW_DEFAULT_MEMORY_POOL="system"
-    )  # it reserves 1 GiB else
+    Thread(target=_end_with_parent, daemon=True).start()
+    os.environ |= dict.fromkeys(THREAD_VARIABLES, "1")
+    os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # its own reserves 1 GiB
     with uncollected():
         for module in hiring.imported:
             import_module(module)
@@ -411,7 +377,14 @@ def _work(pipe: Connection, hiring: _Hiring) -> None:
         pipe.send(None)
         for done in count(1):
             answer = _answered(pipe.recv_bytes(), limit)
-            pipe.send_bytes(pickle.dumps((*answer, done >= hiring.tasks or _memory() > _BYTES)))
+            pipe.send_bytes(pickle.dumps((*answer, done >= hiring.tasks or own_memory("VmRSS") > _BYTES)))
+
+
+def _end_with_parent() -> None:
+    """End this process once the service has gone, whatever it is at."""
+    if parent := multiprocessing.parent_process():
+        parent.join()
+        os._exit(1)
 
 
 def _limit_memory(more: int) -> int:
@@ -422,17 +395,17 @@ def _limit_memory(more: int) -> int:
     """
     import resource  # not there on Windows
 
-    if held := _private():
+    if held := own_memory("VmData"):
         with suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_DATA, (held + more, held + more))
     return more
 
 
-def _private() -> int:
-    """Return the bytes of private memory of this process; 0 where the system does not say."""
+def own_memory(kind: str) -> int:
+    """Return the bytes of memory of this process, of a kind such as VmData; 0 where the system does not say."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmData:"):
+            if line.startswith(f"{kind}:"):
                 return int(line.split()[1]) * 1024
     return 0
 
@@ -457,11 +430,3 @@ def _is_starved(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def _memory() -> int:
-    """Return the bytes of memory that this process holds; 0 where the system does not say."""
-    with suppress(OSError):
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE")
-    return 0

@@ -12,10 +12,11 @@ import os
 import signal
 import sys
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 from typing import Any
 
 from ...cluster.forkserver import uncollected
+from ...cluster.supervised import listen
 
 
 def main() -> None:
@@ -23,22 +24,19 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *about: sys.exit())  # in good order: SLURM's jobs have to be cancelled
     order = json.loads(sys.stdin.readline())
     prepared, gone = Event(), Event()
-    Thread(target=_listen, args=(prepared, gone), daemon=True).start()
+
+    def end() -> None:
+        gone.set()
+        if not prepared.is_set():  # nothing has been started yet
+            os._exit(1)
+
+    listen(str, end)
     from ...errors import TractError
 
     try:
         _hold(order, prepared, gone)
     except TractError as error:
         sys.exit(str(error))
-
-
-def _listen(prepared: Event, gone: Event) -> None:
-    """Set ``gone`` where nobody is left to listen; end at once where nothing has been started yet."""
-    for _ in sys.stdin:
-        pass
-    gone.set()
-    if not prepared.is_set():
-        os._exit(1)
 
 
 def _hold(order: dict[str, Any], prepared: Event, gone: Event) -> None:

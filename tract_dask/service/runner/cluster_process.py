@@ -75,7 +75,7 @@ class Keeper:
                 "credentials": self.credentials,
             }
             forget = partial(self._file.unlink, missing_ok=True)
-            self._holder = Supervised("the cluster", [sys.executable, "-m", _HOLDER], f"{json.dumps(order)}\n", forget)
+            self._holder = Supervised("the cluster", [sys.executable, "-m", _HOLDER], json.dumps(order), forget)
         self._looking = Thread(target=self._look, name="keeper", daemon=True)
         self._looking.start()
 
@@ -100,7 +100,7 @@ class Keeper:
             return self._settings
         holder = self._holder
         deadline = monotonic() + timeout_s
-        while holder is None or holder.pid is None or not self._file.exists():
+        while not (holder and holder.is_alive() and self._file.exists()):
             if monotonic() > deadline or self._ending.is_set():
                 raise ClusterError(
                     "the cluster is not up",

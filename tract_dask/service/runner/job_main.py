@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
 import threading
 from queue import SimpleQueue
 from typing import Any
 
 from ...cluster.forkserver import uncollected
+from ...cluster.supervised import listen
 from ...errors import ExitCode
 
 
@@ -23,8 +23,15 @@ def main() -> int:
     """Do the order on standard input; return the exit code."""
     stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print is no record
-    orders: SimpleQueue[dict[str, Any]] = SimpleQueue()
-    threading.Thread(target=_listen, args=(threading.get_ident(), orders), daemon=True).start()
+    orders, main_thread = SimpleQueue[dict[str, Any]](), threading.get_ident()
+
+    def take(line: str) -> None:
+        if line.strip() == "cancel":
+            signal.pthread_kill(main_thread, signal.SIGINT)
+        else:
+            orders.put(json.loads(line))
+
+    listen(take, _end)
     try:
         with uncollected():
             from .job_work import carry_out
@@ -33,13 +40,8 @@ def main() -> int:
         return ExitCode.INTERRUPTED
 
 
-def _listen(main_thread: int, orders: SimpleQueue[dict[str, Any]]) -> None:
-    """Pass the order on, interrupt the work on request, and end everything where nobody is left to listen."""
-    for line in sys.stdin:
-        if line.strip() == "cancel":
-            signal.pthread_kill(main_thread, signal.SIGINT)
-        else:
-            orders.put(json.loads(line))
+def _end() -> None:
+    """End at once, with all that this process has started."""
     if os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGKILL)
     os._exit(1)

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import signal
 import sqlite3
-import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from queue import Empty, Queue
 from threading import Event, Thread
 from time import monotonic
-from typing import IO, Any
+from typing import Any
 
+from ...cluster.supervised import Child, how_ended
 from ...errors import ClusterError, TractError
 from ...progress import RunState
 from ...readers.listing import FileList
@@ -98,7 +95,8 @@ def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stoppi
         return Ending(State.FAILED, said.error)
     if not said.error and (sign := crash_of(code)):
         return Ending(State.FAILED, str(crashed(job.source, sign)))
-    return after_loss(job, said.error or f"the job's process {_death(code)}", progressed=said.shards > 0)
+    why = said.error or f"the job's process has ended: {how_ended(code)}"
+    return after_loss(job, why, progressed=said.shards > 0)
 
 
 def after_loss(job: Job, reason: str, *, progressed: bool) -> Ending:
@@ -152,29 +150,19 @@ class Attempt(Thread):
 
     def _try(self) -> Ending:
         """Run the process, and follow it to its end."""
-        order = self._order()
-        process = subprocess.Popen(
-            COMMAND,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            errors="replace",
-            start_new_session=True,  # so that it can be killed with all that it started
-        )
-        with process:
-            try:
-                cluster = self._cluster()  # while the process imports what it needs
-                if cluster is None:
-                    return self._ending(0)
-                where = {"cluster": to_dict(cluster), "credentials": self._keeper.credentials}
-                _tell(process, json.dumps(order | where))
-                last_lines = self._follow(process)
-                with suppress(subprocess.TimeoutExpired):  # it has said its last, and does not end
-                    process.wait(GRACE_S)
-            finally:
-                code = _kill(process)
-                seal(self._root, self._mark)
+        order, last_lines = self._order(), deque[str](maxlen=_LAST_LINES)
+        child = Child(COMMAND, last_lines.append, talks=True)
+        try:
+            cluster = self._cluster()  # while the process imports what it needs
+            if cluster is None:
+                return self._ending(0)
+            where = {"cluster": to_dict(cluster), "credentials": self._keeper.credentials}
+            child.tell(json.dumps(order | where))
+            self._follow(child)
+            child.end(GRACE_S)  # it has said its last
+        finally:
+            code = child.end()
+            seal(self._root, self._mark)
         if code and self._said.outcome is None and not self._is_ending():
             for line in last_lines:
                 self._store.log(self._job.id, "error", self._root.shown(line))
@@ -221,34 +209,17 @@ class Attempt(Thread):
                 self._stopping.wait(_LOOK_S)
         return None
 
-    def _follow(self, process: subprocess.Popen[str]) -> deque[str]:
-        """Take what the process says until it says no more; tell it to end where that is wanted.
-
-        Returns
-        -------
-        deque of str
-            The last lines of its standard error.
-        """
-        lines: Queue[str | None] = Queue()
-        last_lines: deque[str] = deque(maxlen=_LAST_LINES)
-        Thread(target=_read, args=(_open(process.stdout), lines), daemon=True).start()
-        errors = Thread(target=last_lines.extend, args=(map(str.rstrip, _open(process.stderr)),), daemon=True)
-        errors.start()
+    def _follow(self, child: Child) -> None:
+        """Take what the process says until it says no more; tell it to end where that is wanted."""
         looked = 0.0
-        while True:
-            try:
-                line = lines.get(timeout=_LOOK_S)
-                if line is None:
-                    errors.join(1.0)
-                    return last_lines
+        for line in child.lines(_LOOK_S):
+            with suppress(ValueError):  # nothing; or the torn last line of a process that was killed
                 self._take(json.loads(line))
-            except (Empty, ValueError):  # the last line of a process that is killed may be torn
-                pass
             if self._asked_at is None and self._is_ending():
                 self._asked_at = monotonic()
-                _tell(process, "cancel")
+                child.tell("cancel")
             if self._asked_at is not None and monotonic() - self._asked_at > GRACE_S:
-                _kill(process)
+                child.end()
             if monotonic() - looked > _WORKERS_S:
                 looked = monotonic()
                 seen = {"workers": self._keeper.workers(), "dashboard": self._keeper.dashboard() is not None}
@@ -280,42 +251,3 @@ class Attempt(Thread):
     def _ending(self, code: int) -> Ending:
         reason = self._store.cancel_reason(self._job.id)
         return ending(self._job, self._said, code, cancel_reason=reason, stopping=self._stopping.is_set())
-
-
-def _read(stream: IO[str], lines: Queue[str | None]) -> None:
-    """Put the lines of a stream into a queue, then None."""
-    for line in stream:
-        lines.put(line)
-    lines.put(None)
-
-
-def _open(stream: IO[str] | None) -> IO[str]:
-    assert stream is not None, "it was asked for"
-    return stream
-
-
-def _tell(process: subprocess.Popen[str], line: str) -> None:
-    """Write a line to a process, which may have died already: its exit code tells."""
-    with suppress(OSError):
-        _open(process.stdin).write(f"{line}\n")
-        _open(process.stdin).flush()
-
-
-def _kill(process: subprocess.Popen[str]) -> int:
-    """Kill a process with all that it started, whether it still runs or not; return its exit code."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    with suppress(OSError):  # what it has not read is still to be written
-        _open(process.stdin).close()
-    return process.wait()
-
-
-def _death(code: int) -> str:
-    """Say how a process ended that gave no reason.
-
-    Examples
-    --------
-    >>> _death(-9), _death(1)
-    ('was killed (SIGKILL)', 'ended with exit code 1')
-    """
-    return f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with exit code {code}"
