@@ -18,7 +18,7 @@ from tract_dask.cluster import connect as cluster
 from tract_dask.cluster import forkserver
 from tract_dask.cluster.tls import using
 from tract_dask.errors import ClusterError, SettingsError
-from tract_dask.service.runner.cluster_process import Keeper
+from tract_dask.service.runner.cluster_process import ClusterProcess
 from tract_dask.settings import ClusterSettings, from_toml, to_toml
 
 VERSION = importlib.metadata.version("tract_dask")
@@ -309,51 +309,51 @@ def children(pid: int) -> list[psutil.Process]:
     return psutil.Process(pid).children(recursive=True)
 
 
-def test_keeper_starts_a_killed_cluster_again_and_leaves_nothing_behind(tmp_path):
-    keeper = Keeper(ClusterSettings(workers=1, memory_limit="700MB"), tmp_path)
+def test_cluster_process_starts_a_killed_cluster_again_and_leaves_nothing_behind(tmp_path):
+    cluster_process = ClusterProcess(ClusterSettings(workers=1, memory_limit="700MB"), tmp_path)
     with pytest.raises(ClusterError, match="not up"):
-        keeper.ready(0.0)
-    assert (keeper.workers(), keeper.dashboard()) == ([], None)
-    keeper.start()
+        cluster_process.ready(0.0)
+    assert (cluster_process.workers(), cluster_process.dashboard()) == ([], None)
+    cluster_process.start()
     try:
-        found = keeper.ready(60.0)
+        found = cluster_process.ready(60.0)
         assert found.resolved_kind == "address"
         first = json.loads(Path(found.scheduler_file).read_text())["address"]
-        wait_for(keeper.workers)
-        (worker,) = keeper.workers()
+        wait_for(cluster_process.workers)
+        (worker,) = cluster_process.workers()
         assert (worker["memory_limit"], worker["executing"], worker["stage"]) == (700_000_000, 0, "")
-        assert keeper.dashboard().startswith("http://127.0.0.1:")
-        holder = next(
+        assert cluster_process.dashboard().startswith("http://127.0.0.1:")
+        cluster_main = next(
             child
             for child in psutil.Process().children()
             if "tract_dask.service.runner.cluster_main" in child.cmdline()
         )
-        before = [holder, *children(holder.pid)]
-        holder.kill()
+        before = [cluster_main, *children(cluster_main.pid)]
+        cluster_main.kill()
         file = Path(found.scheduler_file)
         wait_for(lambda: file.exists() and json.loads(file.read_text())["address"] != first)
-        assert keeper.ready(1.0) == found
-        with using(keeper.credentials), cluster.connect(found) as client:
+        assert cluster_process.ready(1.0) == found
+        with using(cluster_process.credentials), cluster.connect(found) as client:
             assert client.submit(sum, [1, 2]).result() == 3
-        holder = next(
+        cluster_main = next(
             child
             for child in psutil.Process().children()
             if "tract_dask.service.runner.cluster_main" in child.cmdline()
         )
-        after = [holder, *children(holder.pid)]
+        after = [cluster_main, *children(cluster_main.pid)]
     finally:
-        keeper.stop()
+        cluster_process.stop()
     wait_for(lambda: not any(process.is_running() for process in before + after))
 
 
 SERVICE = """
 import sys, time
 from pathlib import Path
-from tract_dask.service.runner.cluster_process import Keeper
+from tract_dask.service.runner.cluster_process import ClusterProcess
 from tract_dask.settings import ClusterSettings
-keeper = Keeper(ClusterSettings(workers=1, memory_limit="700MB"), Path(sys.argv[1]))
-keeper.start()
-keeper.ready(60.0)
+cluster_process = ClusterProcess(ClusterSettings(workers=1, memory_limit="700MB"), Path(sys.argv[1]))
+cluster_process.start()
+cluster_process.ready(60.0)
 print("ready", flush=True)
 time.sleep(600)
 """

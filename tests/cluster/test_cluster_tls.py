@@ -27,7 +27,7 @@ from tract_dask.cluster import tls
 from tract_dask.cluster.certificates import make_certificates
 from tract_dask.errors import ClusterError
 from tract_dask.run import pipeline
-from tract_dask.service.runner.cluster_process import Keeper
+from tract_dask.service.runner.cluster_process import ClusterProcess
 from tract_dask.settings import ClusterSettings, ConvertSettings, RunSettings
 from tract_dask.store.results import open_results
 
@@ -90,19 +90,19 @@ def test_run_on_two_threads_of_an_encrypted_worker(running, certificates, tmp_pa
     xr.testing.assert_equal(open_results(spread.outputs.results).load(), open_results(whole.outputs.results).load())
 
 
-def test_keeper_only_looks_at_a_cluster_of_somebody_else(running, certificates, tmp_path):
+def test_cluster_process_only_looks_at_a_cluster_of_somebody_else(running, certificates, tmp_path):
     settings = ClusterSettings(scheduler_file=str(running), tls=str(certificates))
-    keeper = Keeper(settings, tmp_path)
-    keeper.start()
+    cluster_process = ClusterProcess(settings, tmp_path)
+    cluster_process.start()
     try:
-        assert keeper.ready(1.0) == settings
-        wait_for(keeper.workers)
-        (worker,) = keeper.workers()
+        assert cluster_process.ready(1.0) == settings
+        wait_for(cluster_process.workers)
+        (worker,) = cluster_process.workers()
         assert worker["address"].startswith("tls://127.0.0.1:")
         assert worker["memory"] > 0
-        assert str(keeper.dashboard()).startswith("http://127.0.0.1:")
+        assert str(cluster_process.dashboard()).startswith("http://127.0.0.1:")
     finally:
-        keeper.stop()
+        cluster_process.stop()
 
 
 def test_certificates_of_another_authority_are_refused(running, tmp_path):
@@ -211,12 +211,12 @@ def test_a_client_without_the_credentials_does_not_get_in(address):
 
 
 def test_credentials_are_neither_in_arguments_nor_in_the_environment_nor_in_files(tmp_path):
-    keeper = Keeper(ClusterSettings(workers=1, memory_limit="1GB"), tmp_path)
-    keeper.start()
+    cluster_process = ClusterProcess(ClusterSettings(workers=1, memory_limit="1GB"), tmp_path)
+    cluster_process.start()
     try:
-        settings = keeper.ready(60.0)
-        secret = keeper.credentials["key"].splitlines()[1]
-        wait_for(keeper.workers)
+        settings = cluster_process.ready(60.0)
+        secret = cluster_process.credentials["key"].splitlines()[1]
+        wait_for(cluster_process.workers)
         for process_ in psutil.Process().children(recursive=True):
             with contextlib.suppress(psutil.Error):
                 assert secret not in " ".join(process_.cmdline())
@@ -225,10 +225,10 @@ def test_credentials_are_neither_in_arguments_nor_in_the_environment_nor_in_file
         assert secret not in str(settings)
         with pytest.raises(ClusterError, match="speaks TLS"), cluster.connect(settings, timeout_s=2.0):
             pass
-        with tls.using(keeper.credentials), cluster.connect(settings) as client:
+        with tls.using(cluster_process.credentials), cluster.connect(settings) as client:
             assert client.submit(sum, [1, 2]).result() == 3
     finally:
-        keeper.stop()
+        cluster_process.stop()
 
 
 def test_the_pages_of_a_local_cluster_let_nobody_change_anything():

@@ -24,7 +24,7 @@ FRAMES = (12, 48, 40)
 
 
 class Here(Threads):
-    """A workshop without processes: work is done in a thread."""
+    """A process pool without processes: work is done in a thread."""
 
     async def run_long(self, function: Callable[..., Any], *args: Any, **limits: Any) -> Any:
         return await asyncio.to_thread(function, *args)
@@ -46,8 +46,8 @@ def make_root(root: Path) -> Path:
 def make_app(root: Path, **config: Any) -> FastAPI:
     app = create_app(ServiceConfig(root, **config))
     services: Services = app.state.services
-    services.workshop = Here()
-    services.exports = Exports(services.config.state / "exports", services.workshop)
+    services.pool = Here()
+    services.exports = Exports(services.config.state / "exports", services.pool)
     return app
 
 
@@ -63,6 +63,6 @@ def listening(root: Path, **config: Any) -> Iterator[tuple[str, FastAPI]]:
         try:
             yield f"http://127.0.0.1:{port}", app
         finally:
-            app.state.services.feed.close()
+            app.state.services.streams.close()
             server.should_exit = True
             thread.join()

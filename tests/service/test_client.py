@@ -50,7 +50,7 @@ def client(service):
 @pytest.fixture
 def jobs(service) -> JobStore:
     _, store, app = service
-    until(lambda: len(app.state.services.feed) == 0)
+    until(lambda: len(app.state.services.streams) == 0)
     for job in store.jobs(limit=500):
         if job.state == State.RUNNING:
             store.change(job.id, State.CANCELLED)
@@ -75,7 +75,7 @@ def stages(fit: str, done: int, seconds: float | None = None) -> dict:
 def run(app, job_id: str, end: State = State.DONE, reason: str = "") -> None:
     """What a runner would make of a job, once somebody watches."""
     store = app.state.services.store
-    until(lambda: len(app.state.services.feed) > 0)
+    until(lambda: len(app.state.services.streams) > 0)
     time.sleep(0.1)
     store.change(job_id, State.RUNNING)
     store.progress(job_id, stages("running", 4))
@@ -192,15 +192,15 @@ def test_watching_goes_on_over_a_restart_of_the_service_without_a_gap(tmp_path):
 
         thread = threading.Thread(target=watch)
         thread.start()
-        until(lambda: len(app.state.services.feed) > 0)
+        until(lambda: len(app.state.services.streams) > 0)
         time.sleep(0.1)
         for k in range(3):
             store.log(job.id, "info", f"before {k}")
         time.sleep(0.4)
-        app.state.services.feed.close()  # it ends the stream, and refuses others, as a service does that stops
+        app.state.services.streams.close()  # it ends the stream, and refuses others, as a service does that stops
         for k in range(3):
             store.log(job.id, "info", f"meanwhile {k}")
-        app.state.services.feed._closed = False
+        app.state.services.streams._closed = False
         time.sleep(0.8)
         store.log(job.id, "info", "after")
         store.change(job.id, State.CANCELLED)

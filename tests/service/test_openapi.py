@@ -53,7 +53,7 @@ def service(tmp_path_factory):
         fits = Fits(app.state.services.root.path / jobs[1].output)
         fits.create()
         fits.finish()
-        app.state.services.feed.close()
+        app.state.services.streams.close()
         app.state.services.runner.is_alive = lambda: True  # what GET /health calls well
         yield url, [job.id for job in jobs], app
 

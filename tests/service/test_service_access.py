@@ -28,7 +28,7 @@ from tract_dask.settings import ClusterSettings, SshSettings
 
 HERE = "http://localhost:8000"
 ERROR_PARTS = {"what", "where", "expected", "got", "remedy", "text", "kind"}
-NOBODY = {"keeper": SimpleNamespace(dashboard=lambda: None, workers=list), "is_alive": lambda: True}
+NOBODY = {"cluster": SimpleNamespace(dashboard=lambda: None, workers=list), "is_alive": lambda: True}
 
 
 def make_app(folder, **options):
@@ -406,7 +406,7 @@ def served(tmp_path):
     with LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as cluster:
         app = make_app(tmp_path, port=port)
         address = f"http://127.0.0.1:{cluster.scheduler.http_server.port}"
-        app.state.services.runner.keeper = SimpleNamespace(dashboard=lambda: address, workers=list)
+        app.state.services.runner.cluster = SimpleNamespace(dashboard=lambda: address, workers=list)
         server = uvicorn.Server(uvicorn.Config(app, log_config=None, server_header=False, timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
@@ -487,7 +487,7 @@ def test_without_a_dashboard_a_page_says_so(open_client):
 def test_health_says_what_needs_help(open_client, monkeypatch):
     state = open_client.app.state.services
     assert open_client.get("/api/v1/health").json()["status"] == "degraded"  # no scheduler is known
-    state.runner.keeper = SimpleNamespace(dashboard=lambda: None, workers=lambda: [{"name": "w"}])
+    state.runner.cluster = SimpleNamespace(dashboard=lambda: None, workers=lambda: [{"name": "w"}])
     well = open_client.get("/api/v1/health")
     assert (well.status_code, well.json()["status"], well.json()["workers"]) == (200, "ok", 1)
     state.runner.is_alive = lambda: False

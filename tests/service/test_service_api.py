@@ -17,7 +17,7 @@ from tract_dask.run.plan import plan_run
 from tract_dask.service import checks
 from tract_dask.service import events as feeding
 from tract_dask.service.auth.tokens import Access
-from tract_dask.service.events import Feed
+from tract_dask.service.events import EventStreams
 from tract_dask.service.jobs.states import State
 from tract_dask.service.jobs.store import JobStore
 from tract_dask.settings import RunSettings, from_dict, to_dict
@@ -189,8 +189,8 @@ def test_a_plan_is_that_of_the_run(api, root, monkeypatch):
         assert plan[name] == getattr(truth, name)
     assert (plan["shape"], plan["dtype"], plan["fits"], plan["problem"]) == (list(FRAMES), "uint8", True, "")
     assert plan["seconds"] == pytest.approx(checks.STARTUP_S, abs=0.1)  # a tenth of a megabyte takes no time
-    keeper = api.app.state.services.runner.keeper
-    monkeypatch.setattr(keeper, "workers", lambda: [{"memory_limit": 10_000_000}, {"memory_limit": 0}])
+    cluster = api.app.state.services.runner.cluster
+    monkeypatch.setattr(cluster, "workers", lambda: [{"memory_limit": 10_000_000}, {"memory_limit": 0}])
     small = api.post("plan", json={"source": "movie.npy"}).json()
     assert (small["fits"], small["memory_limit"]) == (False, 10_000_000)
     assert "0.01 GB" in small["problem"]
@@ -256,11 +256,11 @@ def test_every_setting_of_a_job_is_listed_as_it_is_declared(api):
     assert schema["fit"]["properties"]["window_px"]["type"] == ["integer", "null"]
 
 
-def test_workers_are_those_that_the_keeper_sees(api, monkeypatch):
+def test_workers_are_those_that_the_cluster_sees(api, monkeypatch):
     assert api.get("workers").json() == {"workers": [], "dashboard": False}
     worker = {"name": "0", "address": "tcp://127.0.0.1:1", "cpu": 99.5, "memory": 5, "memory_limit": 7}
     worker |= {"executing": 1, "stage": "fit"}
-    monkeypatch.setattr(api.app.state.services.runner.keeper, "workers", lambda: [worker])
+    monkeypatch.setattr(api.app.state.services.runner.cluster, "workers", lambda: [worker])
     assert api.get("workers").json()["workers"] == [worker]
 
 
@@ -388,7 +388,7 @@ def test_events_arrive_once_in_order_and_resume_where_they_broke(root):
         store.delete(first["id"])
         assert resumed.wait_for(5)[-1][1:] == ("job", {"id": first["id"], "deleted": True})
         began = time.monotonic()
-        app.state.services.feed.close()
+        app.state.services.streams.close()
         assert all(one.ended.wait(10) for one in (listener, everything, resumed, stranger))
         assert time.monotonic() - began < 10  # not with the next heartbeat
 
@@ -405,7 +405,7 @@ def test_many_streams_take_one_reader_and_all_get_everything(tmp_path):
     async def scenario() -> None:
         store, other = JobStore(tmp_path / "a.sqlite"), JobStore(tmp_path / "a.sqlite")
         job = store.submit(source="m", settings={}, owner="ana")
-        feed, reads = Feed(store), 0
+        streams, reads = EventStreams(store), 0
         events = store.events
 
         def counted(*args):
@@ -418,11 +418,11 @@ def test_many_streams_take_one_reader_and_all_get_everything(tmp_path):
         found: list[list[bytes]] = [[] for _ in range(60)]
 
         async def listen(chunks: list[bytes]) -> None:
-            async for chunk in feed.listen(store.newest_event()):
+            async for chunk in streams.listen(store.newest_event()):
                 chunks.append(chunk)  # noqa: PERF401  (looked at while it grows)
 
         tasks = [asyncio.create_task(listen(chunks)) for chunks in found]
-        while len(feed) < 60:
+        while len(streams) < 60:
             await asyncio.sleep(0.01)
         await asyncio.sleep(0.3)
         for k in range(200):
@@ -430,13 +430,13 @@ def test_many_streams_take_one_reader_and_all_get_everything(tmp_path):
         async with asyncio.timeout(30):
             while any(len(chunks) < 200 for chunks in found):
                 await asyncio.sleep(0.01)
-        feed.close()
+        streams.close()
         await asyncio.gather(*tasks)
         assert all(len(chunks) == 200 for chunks in found)
         assert len({b"".join(chunks) for chunks in found}) == 1
         assert reads < 60 + 15  # each looked once into the past
-        assert len(feed) == 0
-        assert [chunk async for chunk in feed.listen(0)] == []  # closed for good
+        assert len(streams) == 0
+        assert [chunk async for chunk in streams.listen(0)] == []  # closed for good
 
     asyncio.run(scenario())
 
@@ -445,9 +445,9 @@ def test_a_slow_stream_is_ended_and_holds_up_nobody(tmp_path):
     async def scenario() -> None:
         store = JobStore(tmp_path / "a.sqlite")
         job = store.submit(source="m", settings={}, owner="ana")
-        feed = Feed(store, places=50)
+        streams = EventStreams(store, places=50)
         start = store.newest_event()
-        slow, quick = feed.listen(start), feed.listen(start)
+        slow, quick = streams.listen(start), streams.listen(start)
         store.log(job.id, "info", "first")
         assert b"first" in await anext(slow)
         assert b"first" in await anext(quick)
@@ -469,7 +469,7 @@ def test_a_slow_stream_is_ended_and_holds_up_nobody(tmp_path):
 def test_a_quiet_stream_says_that_it_lives_and_a_broken_store_ends_it(tmp_path, monkeypatch):
     async def scenario() -> None:
         store = JobStore(tmp_path / "a.sqlite")
-        stream = Feed(store, heartbeat_s=0.05).listen(0)
+        stream = EventStreams(store, heartbeat_s=0.05).listen(0)
         assert await anext(stream) == feeding.HEARTBEAT
 
         def broken(*args):

@@ -116,16 +116,16 @@ def rows(columns: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def test_long_tables_stay_in_the_workshop(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_tables_stay_in_the_pool(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     """To pack and unpack what is in them would hold other requests up."""
-    passed, run = [], service.app.state.services.workshop.run
+    passed, run = [], service.app.state.services.pool.run
 
     async def noted(function: Any, *args: Any, **limits: Any) -> Any:
         value = await run(function, *args, **limits)
         passed.extend((*args, *(value if isinstance(value, tuple) else [value])))
         return value
 
-    monkeypatch.setattr(service.app.state.services.workshop, "run", noted)
+    monkeypatch.setattr(service.app.state.services.pool, "run", noted)
     table = {"columns": rows(service.found), "note": "one", "base": 0}
     assert service.post("/columns", table, 201) == {"version": 1, "count": len(TRUTH), "newer": []}
     assert len(service.post("/columns/refine", {"columns": rows(service.found)})["columns"]) == len(TRUTH)

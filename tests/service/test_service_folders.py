@@ -171,7 +171,7 @@ class NobodyWorks:
 @pytest.fixture(scope="module")
 def app(root):
     app = create_app(ServiceConfig(root))
-    app.state.services.workshop = NobodyWorks()
+    app.state.services.pool = NobodyWorks()
     return app
 
 

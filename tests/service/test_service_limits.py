@@ -19,7 +19,7 @@ from tract_dask.errors import SettingsError, SourceError
 from tract_dask.service.api.answers import whole
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.jobs import public
-from tract_dask.service.process_pool import Workshop
+from tract_dask.service.process_pool import ProcessPool
 from tract_dask.service.server import make_application
 from tract_dask.settings import ColumnSettings, FitSettings, SourceSettings, from_dict
 from tract_dask.stages.columns.sites import lattice_columns, settings_lattices
@@ -54,9 +54,9 @@ def deadly(tmp_path_factory):
     for module in (*sys.modules.values(),):
         if getattr(module, "__name__", "").startswith("tract_dask") and hasattr(module, "READERS"):
             patch.setattr(module, "READERS", module.READERS | dict.fromkeys((".crash", ".hang", ".starve"), None))
-    app.state.services.workshop = Workshop(2, memory=512 << 20, imported=("starving",))
+    app.state.services.pool = ProcessPool(2, memory=512 << 20, imported=("starving",))
     yield TestClient(app, base_url=URL, raise_server_exceptions=False)
-    app.state.services.workshop.close()
+    app.state.services.pool.close()
     patch.undo()
 
 
@@ -76,12 +76,12 @@ def test_a_file_that_kills_or_starves_its_reader_is_named(deadly, ask, kind, wor
 
 
 def test_a_file_that_hangs_its_reader_is_named(deadly, monkeypatch):
-    run = deadly.app.state.services.workshop.run
+    run = deadly.app.state.services.pool.run
 
     async def soon(*args, **limits):
         return await run(*args, **limits | {"timeout_s": 1.0})
 
-    monkeypatch.setattr(deadly.app.state.services.workshop, "run", soon)
+    monkeypatch.setattr(deadly.app.state.services.pool, "run", soon)
     answer = deadly.get("files/about", params={"path": "bad.hang"})
     assert answer.status_code == 422
     assert "did not finish" in answer.json()["error"]["what"]
@@ -253,11 +253,11 @@ def test_libraries_reserve_little_of_the_memory_of_a_request():
     """A pool of memory that Arrow reserves for itself, 1 GiB, left half of the limit to a table of columns."""
 
     async def first() -> int:
-        workshop = Workshop(1, memory=2 << 30)
+        pool = ProcessPool(1, memory=2 << 30)
         try:
-            return await workshop.run(reserved)
+            return await pool.run(reserved)
         finally:
-            workshop.close()
+            pool.close()
 
     assert asyncio.run(first()) < 256 << 20
 
@@ -383,7 +383,7 @@ def test_nothing_holds_the_event_loop_up(root):
     for k in range(2000):
         (root / "many" / f"{k}.npy").touch()
     app = make_app(root)
-    app.state.services.workshop = Workshop(
+    app.state.services.pool = ProcessPool(
         1, imported=("tract_dask.service.views.pictures", "tract_dask.service.api.columns")
     )
     store = app.state.services.store
@@ -419,4 +419,4 @@ def test_nothing_holds_the_event_loop_up(root):
     try:
         assert asyncio.run(ask()) == []
     finally:
-        app.state.services.workshop.close()
+        app.state.services.pool.close()

@@ -17,7 +17,7 @@ from tract_dask.readers.listing import FileList
 from tract_dask.service.data_root import Bounds, DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.outputs import Mark
-from tract_dask.service.runner.job_process import Attempt
+from tract_dask.service.runner.job_process import JobProcess
 from tract_dask.service.runner.job_work import Reporter, run_order
 from tract_dask.settings import RunSettings, to_dict
 from tract_dask.stages.convert.stage import convert
@@ -268,9 +268,9 @@ def test_a_job_fails_whose_source_came_to_lead_out(api, root):
     (root / "sub" / "other.npy").symlink_to("/etc/passwd")
     state = api.app.state.services
     state.store.change(job["id"], State.RUNNING)
-    attempt = Attempt(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)
+    process = JobProcess(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)
     with pytest.raises(TractError, match="data root"):
-        attempt._order()
+        process._order()
 
 
 def test_an_order_has_the_settings_as_they_are_stored(api, root):
@@ -279,9 +279,9 @@ def test_an_order_has_the_settings_as_they_are_stored(api, root):
     job = api.post("jobs", json={"source": "movie.npy", "settings": settings}).json()
     services = api.app.state.services
     services.store.change(job["id"], State.RUNNING)
-    attempt = Attempt(services.store.job(job["id"]), services.store, services.root, None, None, lambda: None)
+    process = JobProcess(services.store.job(job["id"]), services.store, services.root, None, None, lambda: None)
     whole = job["settings"]["columns"] | {"csv": str(root / "sub" / "columns.csv")}
-    assert attempt._order()["settings"] == job["settings"] | {"columns": whole}
+    assert process._order()["settings"] == job["settings"] | {"columns": whole}
 
 
 @pytest.mark.parametrize("source", ["sub/other.npy", "frames", "frames/f_*.npy"])
@@ -293,7 +293,7 @@ def test_a_source_that_was_archived_is_the_runs_to_judge(api, root, source):
     (root / source.split("/")[0]).rename(root / "archive")
     state = api.app.state.services
     state.store.change(job["id"], State.RUNNING)
-    order = Attempt(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)._order()
+    order = JobProcess(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)._order()
     assert order["source"] == str(root / source)
     cluster = to_dict(RunSettings())["cluster"]
     with pytest.raises(MissingSourceError):

@@ -20,7 +20,7 @@ from tract_dask.service.deletion import delete_files, finish_deletions
 from tract_dask.service.errors import ForbiddenError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.outputs import MARK, Mark, check_owner, claim, read_mark, seal
-from tract_dask.service.runner.cluster_process import Keeper
+from tract_dask.service.runner.cluster_process import ClusterProcess
 from tract_dask.store import metadata
 from tract_dask.store.locks import sole_use
 from tract_dask.store.run_folder import RunFolder
@@ -287,7 +287,7 @@ def test_the_runner_goes_on_with_deletions_when_it_starts(app, root, clients, mo
     job, folder = done(app, root, clients["ana"])
     app.state.services.store.delete(job["id"], files=True)
     for name in ("start", "stop"):
-        monkeypatch.setattr(Keeper, name, lambda keeper: None)
+        monkeypatch.setattr(ClusterProcess, name, lambda cluster: None)
     app.state.services.runner.start()
     deadline = monotonic() + 20
     while app.state.services.store.deletions() and monotonic() < deadline:

@@ -22,7 +22,7 @@ from tract_dask.service.jobs.records import utc_now
 from tract_dask.service.jobs.states import ENDED, State
 from tract_dask.service.jobs.store import JobStore
 from tract_dask.service.runner import job_process
-from tract_dask.service.runner.job_process import Said, ending
+from tract_dask.service.runner.job_process import ProcessReport, ending
 from tract_dask.service.runner.job_work import place_columns
 from tract_dask.service.runner.runner import Runner
 from tract_dask.service.runner.timeline import SHARES, Timeline
@@ -35,8 +35,8 @@ SETTINGS = {"convert": {"shard_mb": 1}}
 PATIENCE_S = 90.0
 
 
-def said(**more) -> Said:
-    return Said(**more)
+def said(**more) -> ProcessReport:
+    return ProcessReport(**more)
 
 
 OUTCOMES = [
@@ -99,7 +99,7 @@ def queue(store: JobStore, **more):
 
 
 class NoCluster:
-    """A keeper whose cluster is there but for the first ``absent`` times that it is asked for."""
+    """A cluster that is there but for the first ``absent`` times that it is asked for."""
 
     credentials = None
 
@@ -149,10 +149,10 @@ def started(store, tmp_path, monkeypatch):
     monkeypatch.setattr(job_process, "_LOOK_S", 0.02)
     runners = []
 
-    def start(lines: str, keeper: NoCluster | None = None, concurrency: int = 1) -> Runner:
+    def start(lines: str, cluster: NoCluster | None = None, concurrency: int = 1) -> Runner:
         monkeypatch.setattr(job_process, "COMMAND", (sys.executable, "-c", SPEECH + lines))
         runner = Runner(ServiceConfig(tmp_path, concurrency=concurrency), store)
-        runner.keeper = keeper or NoCluster()
+        runner.cluster = cluster or NoCluster()
         runners.append(runner)
         runner.start()
         return runner

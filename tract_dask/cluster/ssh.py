@@ -53,16 +53,16 @@ def hold_ssh(settings: ClusterSettings, memory_limit: int | None) -> Iterator[Lo
         command = _worker_command(cluster.scheduler_address, settings, memory_limit, worker_flags(used))
         commands = {host: shlex.join([*command, "--name", host]) for host in settings.ssh.hosts}
         line = [*_SSH, *settings.ssh.options, "--"]
-        crews = {host: Supervised(f"dask worker on {host}", [*line, host, commands[host]]) for host in commands}
+        processes = {host: Supervised(f"dask worker on {host}", [*line, host, commands[host]]) for host in commands}
         try:
-            _wait_for_one(cluster, crews)
+            _wait_for_one(cluster, processes)
             yield cluster
         finally:
-            for crew in crews.values():
-                crew.let_end()
+            for process in processes.values():
+                process.let_end()
             cluster.close()  # workers end with the scheduler, and ssh with them
-            for crew in crews.values():
-                crew.stop(_STOP_S)
+            for process in processes.values():
+                process.stop(_STOP_S)
 
 
 def _worker_command(address: str, settings: ClusterSettings, memory_limit: int | None, flags: list[str]) -> list[str]:
@@ -91,16 +91,16 @@ def _worker_command(address: str, settings: ClusterSettings, memory_limit: int |
     ]
 
 
-def _wait_for_one(cluster: LocalCluster, crews: dict[str, Supervised]) -> None:
+def _wait_for_one(cluster: LocalCluster, processes: dict[str, Supervised]) -> None:
     """Wait until a worker is there; give up where every host has failed, or none has answered in time."""
     deadline = monotonic() + _START_S
     while not cluster.scheduler_info["workers"]:
-        if all(crew.problem for crew in crews.values()) or monotonic() > deadline:
+        if all(process.problem for process in processes.values()) or monotonic() > deadline:
             raise ClusterError(
                 "no host starts a worker",
-                ", ".join(crews),
+                ", ".join(processes),
                 f"a worker within {_START_S:g} s",
-                "; ".join(f"{host}: {crew.problem or 'no answer'}" for host, crew in crews.items()),
+                "; ".join(f"{host}: {process.problem or 'no answer'}" for host, process in processes.items()),
                 "Check that ssh reaches the hosts without a password, and that the interpreter is there",
             )
         sleep(0.1)

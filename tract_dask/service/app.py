@@ -39,14 +39,14 @@ def _operation_id(route: APIRoute) -> str:
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     services: Services = app.state.services
     services.runner.start()
-    services.workshop.start()
+    services.pool.start()
     try:
         yield
     finally:
-        services.feed.close()
+        services.streams.close()
         await services.upstream.close()
         services.runner.stop()
-        services.workshop.close()
+        services.pool.close()
 
 
 def create_app(config: ServiceConfig) -> FastAPI:

@@ -80,7 +80,7 @@ async def check_job(
     stored, place, whole = await to_thread.run_sync(_checked_parts, root, owner, source, values, output)
     folder = root.path / output if output else None
     file = root.path / source
-    checked = await services.workshop.run(check_source, place, whole, folder, root.permit, about=file)
+    checked = await services.pool.run(check_source, place, whole, folder, root.permit, about=file)
     return stored, output, checked
 
 
@@ -140,7 +140,7 @@ def _problem(plan: Plan, free: int) -> str:
 
 def _memory_limit(services: Services) -> int | None:
     """Return the bytes that a task may use: of the workers that are there, else of those that would be started."""
-    if limits := [worker["memory_limit"] for worker in services.runner.keeper.workers() if worker["memory_limit"]]:
+    if limits := [worker["memory_limit"] for worker in services.runner.cluster.workers() if worker["memory_limit"]]:
         return int(min(limits))
     cluster = services.config.cluster
     return local_memory_limit(cluster) if cluster.resolved_kind == "local" else memory_limit(cluster)

@@ -69,7 +69,7 @@ def chunk(number: int | None, kind: str, data: dict[str, Any]) -> bytes:
     return f"{head}event: {kind}\ndata: {json.dumps(data, separators=(',', ':'))}\n\n".encode()
 
 
-class Feed:
+class EventStreams:
     """The events of the store, for streams.
 
     A stream that resumes reads what it missed from the store, and then what the one reader puts into its queue. The

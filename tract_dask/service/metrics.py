@@ -20,7 +20,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..progress import REPORT, STAGES
-from .events import Feed
+from .events import EventStreams
 from .jobs.records import Job, utc_now
 from .jobs.states import ENDED, State
 from .jobs.store import JobStore
@@ -38,15 +38,15 @@ class Metrics:
     ----------
     store
         Of the jobs.
-    feed
+    streams
         Of the streams.
     """
 
-    def __init__(self, store: JobStore, feed: Feed) -> None:
+    def __init__(self, store: JobStore, streams: EventStreams) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
-        self.registry.register(JobFigures(store, feed))
+        self.registry.register(JobFigures(store, streams))
         self.latency = Histogram(
             "tract_dask_request_seconds",
             "Time from a request to the end of its answer; streams of events are left out.",
@@ -104,8 +104,8 @@ class _Done:
 class JobFigures:
     """Reads what the jobs are, and what they have done since it was last asked, from the store."""
 
-    def __init__(self, store: JobStore, feed: Feed) -> None:
-        self._store, self._feed = store, feed
+    def __init__(self, store: JobStore, streams: EventStreams) -> None:
+        self._store, self._streams = store, streams
         self._lock = Lock()
         self._begun = self._asked = utc_now()
         self._seen: dict[str, _Done] = {}
@@ -128,7 +128,7 @@ class JobFigures:
             stages.add_metric((stage,), self._stages[stage])
         yield from (jobs, seconds, stages)
         yield GaugeMetricFamily("tract_dask_queue_length", "Jobs in the queue.", counts[State.QUEUED])
-        yield GaugeMetricFamily("tract_dask_event_streams", "Streams of events that are open.", len(self._feed))
+        yield GaugeMetricFamily("tract_dask_event_streams", "Streams of events that are open.", len(self._streams))
         yield CounterMetricFamily(
             "tract_dask_frames",
             "Frames whose columns were fitted; those of a resumed fit again.",

@@ -44,11 +44,11 @@ _LEAST_BYTES = 512 << 20
 _COLLECTED = (100_000, 20, 20)
 """When garbage is looked for; as usual, half of the time of a long table would go into that."""
 
-_SHELF_BYTES = 64 << 20
+_CACHE_BYTES = 64 << 20
 _END_S = 5.0
 
 
-class WorkshopError(ClusterError):
+class ProcessPoolError(ClusterError):
     """The pool is full, or a task took too long, or its worker died twice."""
 
 
@@ -57,7 +57,7 @@ class _LostWorkerError(Exception):
 
 
 @dataclass(frozen=True)
-class _Hiring:
+class _WorkerOptions:
     """How workers are: so many tasks each, these modules, so many bytes of private memory (None: no limit)."""
 
     tasks: int
@@ -83,15 +83,15 @@ class _Task:
         if self.about:
             return unending(self.about, self.timeout_s)
         remedy = "Ask for less, or try again when the machine has less to do"
-        return WorkshopError("this takes too long", self.name, f"at most {self.timeout_s:g} s", "more", remedy)
+        return ProcessPoolError("this takes too long", self.name, f"at most {self.timeout_s:g} s", "more", remedy)
 
-    def killed(self) -> WorkshopError:
+    def killed(self) -> ProcessPoolError:
         """Return the error for workers that were killed."""
         remedy = "Try again; if it dies again, the machine may lack memory"
-        return WorkshopError("the process that did this died", self.name, remedy=remedy)
+        return ProcessPoolError("the process that did this died", self.name, remedy=remedy)
 
 
-class Workshop:
+class ProcessPool:
     """A few processes that do what would hold up the other requests.
 
     Parameters
@@ -117,10 +117,10 @@ class Workshop:
         memory: int | None = None,
         imported: tuple[str, ...] = ("tract_dask.service.views.pictures", "tract_dask.service.views.tracks"),
     ) -> None:
-        self._short = _Bench(workers, places, _Hiring(tasks, imported, memory))
-        self._long = _Bench(1, 8, _Hiring(1, imported, memory))
+        self._short = _WorkerGroup(workers, places, _WorkerOptions(tasks, imported, memory))
+        self._long = _WorkerGroup(1, 8, _WorkerOptions(1, imported, memory))
         self._blamed = Blamed()
-        self._shelf, self._coming = Shelf(_SHELF_BYTES), dict[str, asyncio.Task[bytes]]()
+        self._cache, self._pending = ResultCache(_CACHE_BYTES), dict[str, asyncio.Task[bytes]]()
 
     def start(self) -> None:
         """Start the processes now, so that the first request need not wait for them."""
@@ -149,7 +149,7 @@ class Workshop:
             for some minutes, where it did so before with the same file.
         ExhaustedError
             Where it needs too much memory.
-        WorkshopError
+        ProcessPoolError
             Where too many tasks wait, the time is up, or the process was killed twice.
         """
         value: T = await self._at(self._short, _Task(function, args, timeout_s, str(about)))
@@ -162,30 +162,30 @@ class Workshop:
         value: T = await self._at(self._long, _Task(function, args, timeout_s, str(about)))
         return value
 
-    async def _at(self, bench: _Bench, task: _Task) -> Any:
+    async def _at(self, group: _WorkerGroup, task: _Task) -> Any:
         if task.about:
             await asyncio.to_thread(self._blamed.check, task.about)
         try:
-            return await bench.run(task)
+            return await group.run(task)
         except CrashError as error:
             await asyncio.to_thread(self._blamed.add, task.about, error)
             raise
 
-    async def run_kept(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
+    async def run_cached(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
         """Return ``function(*args)``, done once for the same ``key`` as long as there is room to keep its result."""
-        found = self._shelf.get(key)
+        found = self._cache.get(key)
         if found is not None:
             return found
-        task = self._coming.get(key)
+        task = self._pending.get(key)
         if task is None:
-            task = self._coming[key] = asyncio.create_task(self.run(function, *args, about=about))
+            task = self._pending[key] = asyncio.create_task(self.run(function, *args, about=about))
             task.add_done_callback(partial(self._arrived, key))
         return await asyncio.shield(task)
 
     def _arrived(self, key: str, task: asyncio.Task[bytes]) -> None:
-        del self._coming[key]
+        del self._pending[key]
         if not task.cancelled() and task.exception() is None:
-            self._shelf.put(key, task.result())
+            self._cache.put(key, task.result())
 
     def close(self) -> None:
         """End the processes, and what they are at."""
@@ -193,7 +193,7 @@ class Workshop:
         self._long.close()
 
 
-class Shelf:
+class ResultCache:
     """Results by their keys; those that were asked for last, as many as fit.
 
     Parameters
@@ -222,25 +222,25 @@ class Shelf:
             self._held -= len(oldest)
 
 
-class _Bench:
+class _WorkerGroup:
     """Places of a number of workers, and the tasks that wait for them."""
 
-    def __init__(self, workers: int, places: int, hiring: _Hiring) -> None:
+    def __init__(self, workers: int, places: int, options: _WorkerOptions) -> None:
         self._limit, self._closed = workers + places, False
         self._room = Semaphore(self._limit)
-        self._threads = ThreadPoolExecutor(workers, "workshop")
-        self._all = [_Seat(hiring) for _ in range(workers)]
+        self._threads = ThreadPoolExecutor(workers, "process pool")
+        self._all = [_Slot(options) for _ in range(workers)]
         self._free = self._all[::-1]  # as many as threads; the one that was used last is warm
 
     def start(self) -> None:
-        for seat in self._all:
-            seat.start()
+        for slot in self._all:
+            slot.start()
 
     async def run(self, task: _Task) -> Any:
         if not self._room.acquire(blocking=False):
-            raise WorkshopError(
+            raise ProcessPoolError(
                 "the service has too much to do",
-                "workshop",
+                "process pool",
                 f"at most {self._limit} tasks at a time",
                 f"{self._limit + 1}",
                 "Try again in a few seconds",
@@ -250,42 +250,42 @@ class _Bench:
         return await asyncio.wrap_future(future)
 
     def _do(self, task: _Task) -> Any:
-        seat = self._free.pop()
+        slot = self._free.pop()
         try:
-            return self._tried(seat, task)
+            return self._tried(slot, task)
         except _LostWorkerError as lost:
             sign = crash_of(lost.args[0])
             raise (crashed(task.about, sign) if sign and task.about else task.killed()) from None
         finally:
-            self._free.append(seat)
+            self._free.append(slot)
 
-    def _tried(self, seat: _Seat, task: _Task) -> Any:
+    def _tried(self, slot: _Slot, task: _Task) -> Any:
         try:
-            return seat.do(task)
+            return slot.do(task)
         except _LostWorkerError:  # perhaps by what it did before
             if self._closed:
                 raise
-            return seat.do(task)
+            return slot.do(task)
 
     def close(self) -> None:
         self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
         for wait in (False, True):  # a task that was about to begin has started another
             self._threads.shutdown(wait=wait)
-            for seat in self._all:
-                seat.end()
+            for slot in self._all:
+                slot.end()
 
 
-class _Seat:
+class _Slot:
     """The place of one worker: it has one when it needs one, and in time another."""
 
-    def __init__(self, hiring: _Hiring) -> None:
-        self._hiring = hiring
+    def __init__(self, options: _WorkerOptions) -> None:
+        self._options = options
         self._worker: _Worker | None = None
         self._successor: _Worker | None = None
 
     def start(self) -> _Worker:
-        self._worker = self._worker or _Worker(self._hiring)
+        self._worker = self._worker or _Worker(self._options)
         return self._worker
 
     def do(self, task: _Task) -> Any:
@@ -293,13 +293,13 @@ class _Seat:
             self._change()
         try:
             value, tired = self.start().do(task)
-        except (_LostWorkerError, CrashError, ExhaustedError, WorkshopError):
+        except (_LostWorkerError, CrashError, ExhaustedError, ProcessPoolError):
             self._change()
             raise
-        if tired and self._hiring.tasks == 1:
+        if tired and self._options.tasks == 1:
             self._change()
         elif tired and self._successor is None:
-            self._successor = _Worker(self._hiring)  # it starts while the other goes on
+            self._successor = _Worker(self._options)  # it starts while the other goes on
         return value
 
     def _change(self) -> None:
@@ -315,25 +315,25 @@ class _Seat:
 class _Worker:
     """A process that does one task after the other."""
 
-    def __init__(self, hiring: _Hiring) -> None:
+    def __init__(self, options: _WorkerOptions) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, there = context.Pipe()
-        self._process = context.Process(target=_work, args=(there, hiring), name="tract_dask workshop", daemon=True)
+        self._process = context.Process(target=_work, args=(there, options), name="tract_dask pool", daemon=True)
         self._process.start()
         there.close()
-        self._greeted = False
+        self._is_ready = False
 
     @property
     def ready(self) -> bool:
         """Whether it has imported what it needs."""
-        return self._greeted or self._pipe.poll()
+        return self._is_ready or self._pipe.poll()
 
     def do(self, task: _Task) -> tuple[Any, bool]:
         """Return what the function returns, and whether the worker should be replaced."""
         try:
-            if not self._greeted:
+            if not self._is_ready:
                 self._answer(_START_S, _unstarted())
-                self._greeted = True
+                self._is_ready = True
             self._pipe.send((task.function, task.args))
             error, value, tired = self._answer(task.timeout_s, task.late())
         except (EOFError, OSError) as lost:
@@ -357,27 +357,27 @@ class _Worker:
             self._pipe.close()
 
 
-def _unstarted() -> WorkshopError:
+def _unstarted() -> ProcessPoolError:
     what, remedy = "the process that was to do this does not start", "Try again when the machine has less to do"
-    return WorkshopError(what, "workshop", f"at most {_START_S:g} s", remedy=remedy)
+    return ProcessPoolError(what, "process pool", f"at most {_START_S:g} s", remedy=remedy)
 
 
-def _work(pipe: Connection, hiring: _Hiring) -> None:
+def _work(pipe: Connection, options: _WorkerOptions) -> None:
     """Do what comes through the pipe until its other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to answer
     Thread(target=_end_with_parent, daemon=True).start()
     os.environ |= dict.fromkeys(THREAD_VARIABLES, "1")
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # its own reserves 1 GiB
     with uncollected():
-        for module in hiring.imported:
+        for module in options.imported:
             import_module(module)
     gc.set_threshold(*_COLLECTED)
-    limit = 0 if hiring.memory is None else _limit_memory(max(hiring.memory, _LEAST_BYTES))
+    limit = 0 if options.memory is None else _limit_memory(max(options.memory, _LEAST_BYTES))
     with suppress(EOFError, OSError):
         pipe.send(None)
         for done in count(1):
             answer = _answered(pipe.recv_bytes(), limit)
-            pipe.send_bytes(pickle.dumps((*answer, done >= hiring.tasks or own_memory("VmRSS") > _BYTES)))
+            pipe.send_bytes(pickle.dumps((*answer, done >= options.tasks or own_memory("VmRSS") > _BYTES)))
 
 
 def _end_with_parent() -> None:
@@ -420,7 +420,7 @@ def _answered(task: bytes, limit: int) -> tuple[Exception | int | None, bytes]:
             return limit, b""
         if isinstance(error, TractError):
             return error, b""
-        return RuntimeError(f"in the workshop:\n{format_exc()}"), b""
+        return RuntimeError(f"in the process pool:\n{format_exc()}"), b""
 
 
 def _is_starved(error: BaseException | None) -> bool:

@@ -24,7 +24,7 @@ from .auth.headers import host_name
 from .auth.tokens import Access, Role, Token
 from .config import DATABASE, LOCK, LOOPBACK, ServiceConfig, state_folder
 from .data_root import STATE_FOLDER, DataRoot
-from .events import Feed
+from .events import EventStreams
 from .jobs.store import JobStore
 
 SHUTDOWN_S = 3
@@ -68,7 +68,7 @@ def serve(config: ServiceConfig, say: Callable[[str], None]) -> None:
         logging.getLogger(__package__).setLevel(logging.INFO)
         for line in banner(config, notes):
             say(line)
-        server = _Server(_settings(config, app), app.state.services.feed)
+        server = _Server(_settings(config, app), app.state.services.streams)
         with suppress(KeyboardInterrupt):  # uvicorn repeats the signal that it stopped for
             server.run(sockets=[listener])
         say("Stopped. Jobs that were running go on when the service starts again.")
@@ -91,13 +91,13 @@ def make_application(config: ServiceConfig) -> FastAPI:
 class _Server(uvicorn.Server):
     """Ends the streams of events when it stops, since uvicorn waits for requests to end by themselves."""
 
-    def __init__(self, config: uvicorn.Config, feed: Feed) -> None:
+    def __init__(self, config: uvicorn.Config, streams: EventStreams) -> None:
         super().__init__(config)
-        self._feed = feed
+        self._streams = streams
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop to listen, and let all requests end."""
-        self._feed.close()
+        self._streams.close()
         await super().shutdown(sockets)
 
 

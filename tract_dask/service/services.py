@@ -10,10 +10,10 @@ from starlette.requests import HTTPConnection
 from ..cluster.connect import local_memory_limit
 from .auth.tokens import Access
 from .config import ServiceConfig
-from .events import Feed
+from .events import EventStreams
 from .jobs.store import JobStore
 from .metrics import Metrics
-from .process_pool import Workshop
+from .process_pool import ProcessPool
 from .runner.runner import Runner
 from .upstream import Upstream
 from .views.exports import Exports
@@ -29,10 +29,10 @@ class Services:
         config.state.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.config, self.root = config, config.root
         self.store = JobStore(config.database)
-        self.workshop = Workshop(memory=min(REQUEST_BYTES, local_memory_limit(config.cluster)))
-        self.exports = Exports(config.state / "exports", self.workshop)
-        self.feed = Feed(self.store)
-        self.metrics = Metrics(self.store, self.feed)
+        self.pool = ProcessPool(memory=min(REQUEST_BYTES, local_memory_limit(config.cluster)))
+        self.exports = Exports(config.state / "exports", self.pool)
+        self.streams = EventStreams(self.store)
+        self.metrics = Metrics(self.store, self.streams)
         self.access = Access(self.store, config)
         self.runner = Runner(config, self.store)
         self.upstream = Upstream(config.cluster.tls)

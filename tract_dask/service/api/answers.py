@@ -33,12 +33,12 @@ T = TypeVar("T")
 
 
 class Pool(Protocol):
-    """Does the work of requests, as :class:`tract_dask.service.process_pool.Workshop` does in other processes."""
+    """Does the work of requests, as :class:`tract_dask.service.process_pool.ProcessPool` does in other processes."""
 
     async def run(self, function: Callable[..., T], *args: Any, about: str | Path = "") -> T:
         """Return ``function(*args)``; ``about`` is the file or folder that it reads."""
 
-    async def run_kept(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
+    async def run_cached(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
         """Return ``function(*args)``, which may have been kept under this ``key``."""
 
 
@@ -94,5 +94,5 @@ async def kept_answer(
     headers = {"ETag": f'"{key}"', "Cache-Control": _FOREVER if said == version else _ASK}
     if key in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
-    content = await pool.run_kept(key, function, *args, about=str(about))
+    content = await pool.run_cached(key, function, *args, about=str(about))
     return whole(content, media_type, headers)

@@ -61,7 +61,7 @@ class Threads:
         """Return ``function(*args)``."""
         return await asyncio.to_thread(function, *args)
 
-    async def run_kept(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
+    async def run_cached(self, key: str, function: Callable[..., bytes], *args: Any, about: str | Path = "") -> bytes:
         """Return ``function(*args)``, done again each time."""
         return await asyncio.to_thread(function, *args)
 
@@ -69,7 +69,7 @@ class Threads:
 def column_desk(services: Served) -> ColumnDesk:
     """Return the desk of the service's jobs; a notebook has its own in place of this dependency."""
     folder, scene = partial(_folder, services), partial(_scene, services)
-    return ColumnDesk(services.store, services.workshop, folder, scene, services.runner.wake)
+    return ColumnDesk(services.store, services.pool, folder, scene, services.runner.wake)
 
 
 Desk = Annotated[ColumnDesk, Depends(column_desk)]

@@ -240,7 +240,7 @@ class Choice(BaseModel):
 class Given:
     """The columns of a request: places (columns, 2), kinds and numbers, and what was said beside them.
 
-    It never leaves the process of the workshop that reads it: to pack so many values holds other requests up.
+    It never leaves the process of the pool that reads it: to pack so many values holds other requests up.
     """
 
     places: NDArray[np.float64]
@@ -286,7 +286,7 @@ def read_lattice(data: bytes) -> tuple[dict[str, Any], NDArray[np.float64]]:
 
 
 def saved_table(scene: Scene, highest_id: int, data: bytes) -> tuple[str, int, dict[str, Any]]:
-    """Return the table that is to be kept, its number of columns, and what was said beside it; for the workshop.
+    """Return the table that is to be kept, its number of columns, and what was said beside it; for the process pool.
 
     New columns get numbers above ``highest_id``, of the versions that are kept, and those found automatically.
     """
@@ -296,13 +296,13 @@ def saved_table(scene: Scene, highest_id: int, data: bytes) -> tuple[str, int, d
 
 
 def refined_table(scene: Scene, data: bytes) -> bytes:
-    """Return the columns of a request refined, as JSON; for the workshop."""
+    """Return the columns of a request refined, as JSON; for the process pool."""
     given = read_columns(ToRefine, data)
     return column_editing.refined_json(scene, *given.parts, given.said["spacing_px"])
 
 
 def sites_of_lattice(scene: Scene, data: bytes) -> bytes:
-    """Return the sites of the lattice of a request, as JSON; for the workshop."""
+    """Return the sites of the lattice of a request, as JSON; for the process pool."""
     return column_editing.lattice_json(scene, *read_lattice(data))
 
 
@@ -323,7 +323,7 @@ def _sent(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _answers(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
-    """Return the declaration of a route whose answer the workshop makes."""
+    """Return the declaration of a route whose answer the process pool makes."""
     return {200: {"model": model}} | errors(400, 404, 503)
 
 

@@ -10,7 +10,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
-from ..events import Feed, chunk, public_record
+from ..events import EventStreams, chunk, public_record
 from ..jobs.records import Job
 from ..jobs.store import JobStore
 from ..services import Served, Services
@@ -80,12 +80,16 @@ def _resumed(header: str | None, after: int | None) -> int | None:
 def _stream(
     services: Services, after: int | None, job_id: str | None, snapshot: Callable[[JobStore], list[Job]]
 ) -> StreamingResponse:
-    chunks = _chunks(services.feed, services.store, after, job_id, snapshot)
+    chunks = _chunks(services.streams, services.store, after, job_id, snapshot)
     return StreamingResponse(chunks, media_type="text/event-stream")
 
 
 async def _chunks(
-    feed: Feed, store: JobStore, after: int | None, job_id: str | None, snapshot: Callable[[JobStore], list[Job]]
+    streams: EventStreams,
+    store: JobStore,
+    after: int | None,
+    job_id: str | None,
+    snapshot: Callable[[JobStore], list[Job]],
 ) -> AsyncGenerator[bytes]:
     yield _RETRY
     begin, jobs = await anyio.to_thread.run_sync(_beginning, store, after, snapshot)
@@ -93,7 +97,7 @@ async def _chunks(
         yield chunk(None, "job", public_record(job))
     for job in jobs[-1:]:  # who has had the last one has had them all
         yield chunk(begin, "job", public_record(job))
-    async with aclosing(feed.listen(begin, job_id)) as found:
+    async with aclosing(streams.listen(begin, job_id)) as found:
         async for part in found:
             yield part
 

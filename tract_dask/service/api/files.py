@@ -120,5 +120,5 @@ async def about_file(
     root = services.root
     declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
     place, file = await run_in_threadpool(root.source, path), root.path / path
-    found = await services.workshop.run(about_movie, place, declared, root.permit, about=file)
+    found = await services.pool.run(about_movie, place, declared, root.permit, about=file)
     return root.shown(found) | {"path": path}

@@ -55,8 +55,8 @@ def health(services: Served, response: Response) -> Health:
     """Say whether the database, the runner and the cluster are well; 503 where jobs cannot go on without help."""
     database, counts = _database(services.store)
     runner = "ok" if services.runner.is_alive() else "its thread has ended: see the service's log, and start it again"
-    workers = len(services.runner.keeper.workers())
-    cluster = "ok" if workers or services.runner.keeper.dashboard() else "its scheduler does not answer"
+    workers = len(services.runner.cluster.workers())
+    cluster = "ok" if workers or services.runner.cluster.dashboard() else "its scheduler does not answer"
     failed = database != "ok" or runner != "ok"
     response.status_code = HTTPStatus.SERVICE_UNAVAILABLE if failed else HTTPStatus.OK
     return Health(

@@ -162,5 +162,5 @@ def list_settings() -> dict[str, Any]:
 @router.get("/workers", response_model=WorkerList, responses=errors())
 def list_workers(services: Served) -> dict[str, Any]:
     """List the workers of the cluster and what they do."""
-    keeper = services.runner.keeper
-    return {"workers": keeper.workers(), "dashboard": keeper.dashboard() is not None}
+    cluster = services.runner.cluster
+    return {"workers": cluster.workers(), "dashboard": cluster.dashboard() is not None}

@@ -184,12 +184,12 @@ router.include_router(sums)
 
 
 async def _picture(request: Request, services: Services, frame: pictures.MovieFrame, seen: View, said: str) -> Response:
-    pool, make = services.workshop, pictures.source_png
+    pool, make = services.pool, pictures.source_png
     return await kept_answer(request, pool, "image/png", frame.stamp, make, frame, seen, about=frame.named, said=said)
 
 
 async def _levels(request: Request, services: Services, frame: pictures.MovieFrame, seen: View) -> Response:
-    pool, make = services.workshop, pictures.source_levels
+    pool, make = services.pool, pictures.source_levels
     return await kept_answer(request, pool, "application/json", frame.stamp, make, frame, seen, about=frame.named)
 
 

@@ -147,7 +147,7 @@ async def _answer(
     places: tuple[Path, ...] = (path.parent, services.config.state / "tracks")
     if function is tracks.displacement:
         places = places[:1]
-    pool = services.workshop
+    pool = services.pool
     return await kept_answer(request, pool, "application/json", version, function, *places, *args, version, about=path)
 
 

@@ -66,8 +66,7 @@ class PublicJob:
     outcome: dict[str, Any]
     columns_version: int | None = field(
         metadata={
-            "description": "Version of the columns that is fitted; 0: those found automatically; "
-            "null: none chosen yet."
+            "description": "Version of the columns that is fitted; 0: those found automatically; null: none chosen yet."
         }
     )
     not_before: str | None = field(

@@ -87,7 +87,7 @@ def home() -> Response:
 @dashboard.api_route(PREFIX + "/{path:path}", methods=["GET", "HEAD"])
 async def page(request: Request, services: Served, path: str) -> Response:
     """Pass a page of the dashboard, or a part of one, on."""
-    address, parts = services.runner.keeper.dashboard(), canonical(request.scope)
+    address, parts = services.runner.cluster.dashboard(), canonical(request.scope)
     if not may_pass(parts):
         raise HTTPException(HTTPStatus.NOT_FOUND)
     if address is None:
@@ -108,7 +108,7 @@ async def page(request: Request, services: Served, path: str) -> Response:
 @dashboard.websocket(PREFIX + "/{path:path}")
 async def socket(client: WebSocket, services: Served, path: str) -> None:
     """Pass the messages of a page's socket on, both ways."""
-    address, parts = services.runner.keeper.dashboard(), canonical(client.scope)
+    address, parts = services.runner.cluster.dashboard(), canonical(client.scope)
     if address is None or not (parts[-1:] == (_SOCKET,) and _is_page(parts[:-1])):
         await client.close(_NO_DASHBOARD)
         return

@@ -31,14 +31,14 @@ from ...settings.toml import to_dict
 
 _log = logging.getLogger(__name__)
 
-_HOLDER = f"{__package__}.cluster_main"
+_MAIN = f"{__package__}.cluster_main"
 _LOOK_S = 1.0
 _ANSWER_S = 5.0
 _STALE_S = 5.0
 _STOP_S = 20.0
 
 
-class Keeper:
+class ClusterProcess:
     """Keeps a cluster running, and looks at its workers once a second; safe to use from any thread.
 
     Parameters
@@ -59,7 +59,7 @@ class Keeper:
         self._is_ours = settings.resolved_kind != "address"
         is_local = settings.resolved_kind == "local" and settings.tls is None
         self.credentials = temporary_credentials() if is_local else None
-        self._holder: Supervised | None = None
+        self._process: Supervised | None = None
         self._looking: Thread | None = None
         self._ending = Event()
         self._seen: tuple[float, list[dict[str, Any]], str | None] = (-_STALE_S, [], None)
@@ -75,15 +75,15 @@ class Keeper:
                 "credentials": self.credentials,
             }
             forget = partial(self._file.unlink, missing_ok=True)
-            self._holder = Supervised("the cluster", [sys.executable, "-m", _HOLDER], json.dumps(order), forget)
-        self._looking = Thread(target=self._look, name="keeper", daemon=True)
+            self._process = Supervised("the cluster", [sys.executable, "-m", _MAIN], json.dumps(order), forget)
+        self._looking = Thread(target=self._look, name="cluster", daemon=True)
         self._looking.start()
 
     def stop(self) -> None:
         """End the process and its workers; returns when they are gone."""
         self._ending.set()
-        if self._holder is not None:
-            self._holder.stop(_STOP_S)
+        if self._process is not None:
+            self._process.stop(_STOP_S)
         if self._looking is not None:
             self._looking.join()
 
@@ -98,15 +98,15 @@ class Keeper:
         if not self._is_ours:
             checked_address(scheduler_address(self._settings), self._settings.tls)
             return self._settings
-        holder = self._holder
+        process = self._process
         deadline = monotonic() + timeout_s
-        while not (holder and holder.is_alive() and self._file.exists()):
+        while not (process and process.is_alive() and self._file.exists()):
             if monotonic() > deadline or self._ending.is_set():
                 raise ClusterError(
                     "the cluster is not up",
                     f"kind {self._settings.resolved_kind}",
                     f"a scheduler within {timeout_s:g} s",
-                    (holder and holder.problem) or "none yet",
+                    (process and process.problem) or "none yet",
                     "See what it says; it is started again by itself",
                 )
             self._ending.wait(0.05)

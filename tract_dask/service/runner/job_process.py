@@ -27,7 +27,7 @@ from ..jobs.records import Job, utc_now
 from ..jobs.states import AFTER_RUN, State
 from ..jobs.store import JobStore
 from ..outputs import Mark, check_owner, seal
-from .cluster_process import Keeper
+from .cluster_process import ClusterProcess
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ _LAST_LINES = 20
 
 
 @dataclass
-class Said:
+class ProcessReport:
     """What a try's process has said so far."""
 
     shards: int = 0
@@ -70,7 +70,7 @@ class Ending:
     fields: dict[str, Any] = field(default_factory=dict)
 
 
-def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stopping: bool) -> Ending:
+def ending(job: Job, report: ProcessReport, code: int, *, cancel_reason: str | None, stopping: bool) -> Ending:
     """Return what becomes of a job whose process has ended; a pure function but for the time of the next try.
 
     Parameters
@@ -82,21 +82,21 @@ def ending(job: Job, said: Said, code: int, *, cancel_reason: str | None, stoppi
     stopping
         Whether the service is about to end.
     """
-    if said.outcome is not None and (cancel_reason is None or said.outcome["state"] != RunState.STOPPED):
-        state = AFTER_RUN[said.outcome["state"]]
-        fields = {} if state == State.WAITING else {"outcome": said.outcome}
+    if report.outcome is not None and (cancel_reason is None or report.outcome["state"] != RunState.STOPPED):
+        state = AFTER_RUN[report.outcome["state"]]
+        fields = {} if state == State.WAITING else {"outcome": report.outcome}
         reason = "the columns can be looked at" if state == State.WAITING else ""
         return Ending(state, reason, fields | {"lost_tries": 0})
     if cancel_reason is not None:
         return Ending(State.CANCELLED, cancel_reason)
     if stopping:
         return Ending(State.QUEUED, "the service was stopped")
-    if said.error and not said.lost:
-        return Ending(State.FAILED, said.error)
-    if not said.error and (sign := crash_of(code)):
+    if report.error and not report.lost:
+        return Ending(State.FAILED, report.error)
+    if not report.error and (sign := crash_of(code)):
         return Ending(State.FAILED, str(crashed(job.source, sign)))
-    why = said.error or f"the job's process has ended: {how_ended(code)}"
-    return after_loss(job, why, progressed=said.shards > 0)
+    why = report.error or f"the job's process has ended: {how_ended(code)}"
+    return after_loss(job, why, progressed=report.shards > 0)
 
 
 def after_loss(job: Job, reason: str, *, progressed: bool) -> Ending:
@@ -108,7 +108,7 @@ def after_loss(job: Job, reason: str, *, progressed: bool) -> Ending:
     return Ending(State.QUEUED, reason, {"lost_tries": lost, "not_before": utc_now(later_s=backoff)})
 
 
-class Attempt(Thread):
+class JobProcess(Thread):
     """A thread that sees a job through one try, from RUNNING to whatever comes then.
 
     Parameters
@@ -122,12 +122,18 @@ class Attempt(Thread):
     """
 
     def __init__(
-        self, job: Job, store: JobStore, root: DataRoot, keeper: Keeper, stopping: Event, done: Callable[[], object]
+        self,
+        job: Job,
+        store: JobStore,
+        root: DataRoot,
+        cluster: ClusterProcess,
+        stopping: Event,
+        done: Callable[[], object],
     ) -> None:
         super().__init__(name=f"job {job.id}", daemon=True)
-        self._job, self._store, self._root, self._keeper = job, store, root, keeper
+        self._job, self._store, self._root, self._cluster = job, store, root, cluster
         self._stopping, self._done = stopping, done
-        self._mark, self._said = Mark(job.owner, job.id, job.output), Said()
+        self._mark, self._report = Mark(job.owner, job.id, job.output), ProcessReport()
         self._asked_at: float | None = None
 
     def run(self) -> None:
@@ -153,17 +159,17 @@ class Attempt(Thread):
         order, last_lines = self._order(), deque[str](maxlen=_LAST_LINES)
         child = Child(COMMAND, last_lines.append, talks=True)
         try:
-            cluster = self._cluster()  # while the process imports what it needs
+            cluster = self._running_cluster()  # while the process imports what it needs
             if cluster is None:
                 return self._ending(0)
-            where = {"cluster": to_dict(cluster), "credentials": self._keeper.credentials}
+            where = {"cluster": to_dict(cluster), "credentials": self._cluster.credentials}
             child.tell(json.dumps(order | where))
             self._follow(child)
             child.end(GRACE_S)  # it has said its last
         finally:
             code = child.end()
             seal(self._root, self._mark)
-        if code and self._said.outcome is None and not self._is_ending():
+        if code and self._report.outcome is None and not self._is_ending():
             for line in last_lines:
                 self._store.log(self._job.id, "error", self._root.shown(line))
         return self._ending(code)
@@ -191,7 +197,7 @@ class Attempt(Thread):
             "stages": job.progress.get("stages", {}),
         }
 
-    def _cluster(self) -> ClusterSettings | None:
+    def _running_cluster(self) -> ClusterSettings | None:
         """Return the running cluster; None where the try is to end meanwhile.
 
         Raises
@@ -202,7 +208,7 @@ class Attempt(Thread):
         deadline = monotonic() + CLUSTER_S
         while not self._is_ending():
             try:
-                return self._keeper.ready(timeout_s=1.0)
+                return self._cluster.ready(timeout_s=1.0)
             except ClusterError:
                 if monotonic() > deadline:
                     raise
@@ -222,7 +228,7 @@ class Attempt(Thread):
                 child.end()
             if monotonic() - looked > _WORKERS_S:
                 looked = monotonic()
-                seen = {"workers": self._keeper.workers(), "dashboard": self._keeper.dashboard() is not None}
+                seen = {"workers": self._cluster.workers(), "dashboard": self._cluster.dashboard() is not None}
                 self._store.workers(self._job.id, seen)
 
     def _take(self, record: dict[str, Any]) -> None:
@@ -232,22 +238,22 @@ class Attempt(Thread):
             case "stage":
                 self._store.stage(job_id, record["stage"])
             case "progress":
-                self._said.shards = record["shards"]
+                self._report.shards = record["shards"]
                 self._store.progress(job_id, record["data"])
             case "log":
                 self._store.log(job_id, record["level"], record["message"])
             case "outcome":
-                self._said.outcome = {name: value for name, value in record.items() if name != "kind"}
+                self._report.outcome = {name: value for name, value in record.items() if name != "kind"}
             case "error":
-                self._said.error, self._said.lost = record["text"], record["lost"]
+                self._report.error, self._report.lost = record["text"], record["lost"]
 
     def _is_ending(self) -> bool:
         return self._stopping.is_set() or self._store.cancel_requested(self._job.id)
 
     def _lost(self, why: str) -> Ending:
-        self._said.error, self._said.lost = why, True
+        self._report.error, self._report.lost = why, True
         return self._ending(1)
 
     def _ending(self, code: int) -> Ending:
         reason = self._store.cancel_reason(self._job.id)
-        return ending(self._job, self._said, code, cancel_reason=reason, stopping=self._stopping.is_set())
+        return ending(self._job, self._report, code, cancel_reason=reason, stopping=self._stopping.is_set())

@@ -15,8 +15,8 @@ from ..deletion import finish_deletions
 from ..jobs.records import Job, utc_now
 from ..jobs.states import State
 from ..jobs.store import JobStore
-from .cluster_process import Keeper
-from .job_process import Attempt
+from .cluster_process import ClusterProcess
+from .job_process import JobProcess
 
 _log = logging.getLogger(__name__)
 
@@ -35,14 +35,14 @@ class Runner:
 
     Attributes
     ----------
-    keeper
+    cluster
         Keeps the cluster.
     """
 
     def __init__(self, config: ServiceConfig, store: JobStore) -> None:
-        self.keeper = Keeper(config.cluster, config.state)
+        self.cluster = ClusterProcess(config.cluster, config.state)
         self._config, self._store, self._root = config, store, config.root
-        self._attempts: dict[str, Attempt] = {}
+        self._processes: dict[str, JobProcess] = {}
         self._awake, self._stopping = Event(), Event()
         self._thread: Thread | None = None
         self._held = ExitStack()
@@ -60,7 +60,7 @@ class Runner:
         self._stopping.clear()
         self._recover("the service had been killed")
         Thread(target=finish_deletions, args=(self._root, self._store), name="tidying", daemon=True).start()
-        self.keeper.start()
+        self.cluster.start()
         self._thread = Thread(target=self._loop, name="runner", daemon=True)
         self._thread.start()
 
@@ -70,9 +70,9 @@ class Runner:
         self._awake.set()
         if self._thread is not None:
             self._thread.join()
-        for attempt in self._attempts.values():
-            attempt.join()
-        self.keeper.stop()
+        for process in self._processes.values():
+            process.join()
+        self.cluster.stop()
         self._held.close()
 
     def is_alive(self) -> bool:
@@ -94,9 +94,9 @@ class Runner:
 
     def _fill(self) -> None:
         """Start as many jobs as there is room for."""
-        self._attempts = {name: attempt for name, attempt in self._attempts.items() if attempt.is_alive()}
+        self._processes = {name: process for name, process in self._processes.items() if process.is_alive()}
         self._recover("its thread had ended")
-        while len(self._attempts) < self._config.concurrency and not self._stopping.is_set():
+        while len(self._processes) < self._config.concurrency and not self._stopping.is_set():
             job = next_job(self._store.queued(), self._store.running(), self._store.served(), utc_now())
             if job is None:
                 return
@@ -104,14 +104,14 @@ class Runner:
 
     def _start(self, job: Job) -> None:
         job = self._store.change(job.id, State.RUNNING, "its turn")
-        attempt = Attempt(job, self._store, self._root, self.keeper, self._stopping, self.wake)
-        self._attempts[job.id] = attempt
-        attempt.start()
+        process = JobProcess(job, self._store, self._root, self.cluster, self._stopping, self.wake)
+        self._processes[job.id] = process
+        process.start()
 
     def _recover(self, reason: str) -> None:
         """Put jobs back into the queue that are noted as running, but that nobody runs."""
         for job in self._store.running():
-            if job.id in self._attempts:
+            if job.id in self._processes:
                 continue
             cancelled = self._store.cancel_reason(job.id)
             if cancelled is None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from ...export.tables import export
 from ...store.parts import SHARDED
 from ...store.results import growing_files
-from ..process_pool import Workshop
+from ..process_pool import ProcessPool
 from .tracks import open_finished
 
 FORMATS = {"zarr": "application/zip", "nc": "application/x-netcdf", "csv": "text/csv; charset=utf-8"}
@@ -33,8 +33,8 @@ class Exports:
         Where they are; made when it is needed.
     """
 
-    def __init__(self, folder: Path, workshop: Workshop) -> None:
-        self._folder, self._workshop = folder, workshop
+    def __init__(self, folder: Path, pool: ProcessPool) -> None:
+        self._folder, self._pool = folder, pool
         self._coming: dict[Path, asyncio.Task[None]] = {}
 
     def place(self, results: Path, version: str, suffix: str) -> Path:
@@ -57,7 +57,7 @@ class Exports:
         if task is None:
             self._folder.mkdir(parents=True, exist_ok=True)
             _tidy(self._folder)
-            task = asyncio.create_task(self._workshop.run_long(write_file, results, place, about=results))
+            task = asyncio.create_task(self._pool.run_long(write_file, results, place, about=results))
             self._coming[place] = task
             task.add_done_callback(lambda _: self._coming.pop(place))
         done, _ = await asyncio.wait({task}, timeout=wait_s)
