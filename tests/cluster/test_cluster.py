@@ -80,7 +80,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from urllib.request import urlopen
 
-from tract_dask import cluster
+from tract_dask.cluster import connect as cluster
 from tract_dask.settings import ClusterSettings
 
 if __name__ == "__main__":

@@ -64,14 +64,14 @@ async def ask_as_the_service_does():
 in_threads(ask, lambda: asyncio.run(ask_as_the_service_does()))
 """
     watched = ("httpx", "httpcore", "h11")
-    for module in ("client", "service.dashboard"):
+    for module in ("service.client", "service.upstream"):
         assert imported_in_threads(watched, code.format(module=module)) == []
 
 
 def test_tasks_import_no_codec():
     code = """
 import numpy as np
-from tract_dask import stages
+from tract_dask.run import worker_imports
 from tract_dask.store.shard_files import _blosc
 
 in_threads(lambda: _blosc.blosc_encode(np.zeros(64, np.uint8)))

@@ -18,7 +18,7 @@ from tract_dask.cluster import connect as cluster
 from tract_dask.cluster import tries
 from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError, StoreError
 from tract_dask.progress import REPORT, STAGES, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
-from tract_dask.run import one_stage, pipeline
+from tract_dask.run import one_stage, pipeline, session
 from tract_dask.run import plan as run_plan
 from tract_dask.settings import ConvertSettings, RunSettings, toml
 from tract_dask.store import datasets, files, run_folder
@@ -106,7 +106,7 @@ def test_run_writes_everything_and_finds_the_scene(job, scene):
 
 
 def test_a_report_that_fails_is_a_warning_of_a_finished_run(done, monkeypatch):
-    monkeypatch.setattr("tract_dask.report.write_report", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("tract_dask.report.page.write_report", lambda *_, **__: 1 / 0)
     assert done(report=True).state == "done"
     assert "division by zero" in done.of(Warned)[0].message
     assert not (done.output / "report.html").exists()
@@ -177,10 +177,8 @@ def test_interrupted_and_failed_runs_go_on_to_the_same_result(base, done, monkey
         return measure(*arguments)
 
     monkeypatch.setattr(fit_stage, "measure", fail_at_the_third)
-    from tract_dask.stages import keep
-
-    fit_here = keep.fit.fit_movie
-    monkeypatch.setattr(keep.fit, "fit_movie", lambda *args, **more: fit_here(*args, **(more | {"client": None})))
+    fit_here = fit_stage.fit_movie
+    monkeypatch.setattr(fit_stage, "fit_movie", lambda *args, **more: fit_here(*args, **(more | {"client": None})))
     with pytest.raises(KeyboardInterrupt):
         done()
     assert done.of(RunDone)[-1].state == "interrupted"
@@ -213,7 +211,7 @@ def test_work_over_budget_is_refused_with_both_numbers(job):
 
 
 def test_memory_is_checked_before_work(job, monkeypatch):
-    monkeypatch.setattr(pipeline, "memory_budget", lambda client: 1_000)
+    monkeypatch.setattr(session, "memory_budget", lambda client: 1_000)
     with pytest.raises(ClusterError, match="does not fit"):
         job()
     assert not (job.output / "movie.zarr").exists()

@@ -87,7 +87,7 @@ CHANGES = {
     "amplitude": {"columns": {"min_amplitude": 0.2}},
     "spacing": {"columns": {"spacing_px": 30.0}},
     "search": {"columns": {"search_radius_px": 2.0}},
-    "refinement": {"drift": {"refine": False}},
+    "refinement": {"fit": {"refine_drift": False}},
     "drift": {"drift": {"method": "none"}},
 }
 

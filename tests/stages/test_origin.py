@@ -19,7 +19,6 @@ from tract_dask.readers import open_source
 from tract_dask.run import one_stage, pipeline, session
 from tract_dask.run.verify import repair, verify
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, RunSettings, SourceSettings
-from tract_dask.stages import keep
 from tract_dask.stages.convert import shard as convert_shard
 from tract_dask.stages.convert import stage as convert_stage
 from tract_dask.stages.convert.origin import movie_key
@@ -27,6 +26,7 @@ from tract_dask.stages.convert.stage import convert
 from tract_dask.store import files as store_files
 from tract_dask.store import metadata as store_metadata
 from tract_dask.store import provenance
+from tract_dask.store.keys import counted
 from tract_dask.store.movie import open_movie
 from tract_dask.store.stamps import Stamps
 
@@ -593,4 +593,4 @@ def test_drift_and_columns_files_count_by_what_they_hold(folder):
     unused = dataclasses.replace(settings, drift=dataclasses.replace(settings.drift, csv=str(moved)))
     run(folder / "movie.npy", folder / "out", settings)
     assert run(folder / "movie.npy", folder / "out", unused) == (set(), [])
-    assert keep.counted("drift", drift=unused.drift) == {}
+    assert counted("drift", drift=unused.drift) == {}
