@@ -49,3 +49,8 @@ def test_canonical_is_the_same_gaussian_and_its_own_label(parameters):
     assert -np.pi / 2 < labelled[5] <= np.pi / 2
     np.testing.assert_allclose(gaussian_image(labelled, (9, 9)), gaussian_image(parameters, (9, 9)), atol=1e-9)
     np.testing.assert_array_equal(canonical(labelled), labelled)
+
+
+def test_an_angle_that_rounds_to_the_open_end_is_the_closed_one():
+    theta = np.nextafter(np.pi / 2, 2)
+    assert -np.pi / 2 < canonical([1.0, 0.0, 0.0, 3.0, 2.0, theta, 0.0])[5] <= np.pi / 2

@@ -538,6 +538,12 @@ def test_a_store_that_was_being_removed_is_gone(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_store_that_comes_after_both_looks_is_not_there_yet(tmp_path, monkeypatch):
+    marks = iter([False, True])
+    monkeypatch.setattr(store_metadata, "_is_marked", lambda path: next(marks))
+    assert store_metadata.attributes(tmp_path / "late.zarr") == {}
+
+
 def test_a_store_that_comes_between_two_looks_is_not_damaged(tmp_path, monkeypatch):
     aside, store = tmp_path / "aside", tmp_path / "sum.zarr"
     datasets.write_dataset(

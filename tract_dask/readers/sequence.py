@@ -121,7 +121,7 @@ def gaps(names: list[str]) -> tuple[str, ...]:
     Examples
     --------
     >>> gaps(["f_001.tif", "f_002.tif", "f_005.tif"])
-    ('the sequence has a gap in its numbers: f_005.tif follows f_002.tif; the frames are taken as they are',)
+    ('the sequence has a gap in its numbers: f_005.tif follows f_002.tif; the frames are read without one for the gap',)
     """
     if len({re.sub(r"\d+", "#", name) for name in names}) > 1:
         return ()

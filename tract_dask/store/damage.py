@@ -105,6 +105,8 @@ def frames_in(file: Path) -> tuple[int, int] | None:
 def remedy(file: Path) -> str:
     """Return what makes a damaged store whole again, as a sentence without its full stop."""
     store, again = store_of(file), "run the command that wrote it again"
+    if not store.parent.exists():
+        return f"{store.parent} is not there any more: run the command in the folder's new place, or bring it back"
     if any(folder.name.endswith(".zarr.journal") for folder in file.parents):
         return "Run the same command again: it makes again what is damaged"
     if file.name != METADATA and (store / "frame_bad_pixels").exists():  # a movie

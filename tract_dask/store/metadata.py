@@ -38,11 +38,12 @@ def attributes(path: Path) -> dict[str, Any]:
     """
     file = path / METADATA
     metadata = read_json(file)
-    if not metadata and _is_marked(path):
+    marked = not metadata and _is_marked(path)
+    if marked:
         metadata = read_json(file)  # it may have been put there between the two looks
     found = metadata.get("attributes", {}).get(ATTRIBUTE)
     if not isinstance(found, dict):
-        if _is_marked(path):
+        if marked or (metadata and _is_marked(path)):
             raise damaged(file, "no metadata of tract_dask" if metadata else "no such file")
         return {}
     number, checksum = format_of(found), found.pop("checksum", None)

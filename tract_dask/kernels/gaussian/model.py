@@ -35,7 +35,8 @@ def canonical(parameters: npt.ArrayLike) -> Floats:
     first, second, theta = np.abs(result[..., 3]), np.abs(result[..., 4]), result[..., 5]
     turned = np.where(first >= second, theta, theta + np.pi / 2)
     result[..., 3], result[..., 4] = np.maximum(first, second), np.minimum(first, second)
-    result[..., 5] = np.pi / 2 - np.mod(np.pi / 2 - turned, np.pi)
+    folded = np.pi / 2 - np.mod(np.pi / 2 - turned, np.pi)
+    result[..., 5] = np.where(folded > -np.pi / 2, folded, np.pi / 2)  # the remainder may be rounded up to pi
     return result
 
 
