@@ -137,7 +137,8 @@ def test_a_movie_is_chosen_looked_at_and_measured_from_the_page(chromium, tmp_pa
         expect(page.locator("#figures dd").nth(1)).to_have_text(str(len(scene.place)))
         expect(page.locator("#picture-title")).to_have_text("Sum of the frames")
         drift = page.locator("#drift canvas")
-        expect(drift).to_have_attribute("aria-label", re.compile("Drift: x from .* to .*; y from"))
+        curves = re.compile("Drift: x from .* to .*; y from")
+        expect(drift).to_have_attribute("aria-label", curves, timeout=RUN_MS)  # the first answer's process imports
         largest = np.abs(scene.drift * 8.0).max()
         assert max(map(abs, _numbers(drift.get_attribute("aria-label")))) == pytest.approx(largest, abs=0.5 * 8.0)
         accepted = _numbers(page.locator("#accepted canvas").get_attribute("aria-label"))
