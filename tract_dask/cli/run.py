@@ -178,7 +178,7 @@ def get_ready(settings: RunSettings) -> None:
     if not (settings.cluster.scheduler or settings.cluster.scheduler_file):
         forkserver.start()
     with forkserver.uncollected():
-        from ..run import one_stage  # noqa: F401
+        from ..run import one_stage, pipeline  # noqa: F401
 
 
 def _show_outcome(outcome: RunOutcome, *, as_json: bool) -> None:

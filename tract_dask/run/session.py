@@ -131,6 +131,7 @@ class Record:
 def _get_ready() -> None:
     """Import what the later stages need here, and make the compiler ready to load kernels."""
     from .. import report  # noqa: F401
+    from ..stages.columns import find  # noqa: F401
     from ..kernels.registration import load_kernels
     from ..plots.columns import plot_columns  # noqa: F401
 
