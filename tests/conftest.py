@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from distributed import Client, LocalCluster
 from hypothesis import settings
 from numba.core.dispatcher import Dispatcher
 
@@ -47,6 +48,33 @@ def state_home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A cluster of one worker with two threads, in this process."""
+    with (
+        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A service's data root."""
+    from serviced import make_root
+
+    return make_root(tmp_path / "data")
+
+
+@pytest.fixture
+def api(root):
+    """The API of a service on that root."""
+    from fastapi.testclient import TestClient
+    from serviced import URL, make_app
+
+    return TestClient(make_app(root), base_url=URL, raise_server_exceptions=False)
 
 
 @pytest.fixture(scope="module")

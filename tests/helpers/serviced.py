@@ -20,6 +20,7 @@ from tract_dask.service.config import ServiceConfig
 from tract_dask.service.services import Services
 from tract_dask.service.views.exports import Exports
 
+URL = "http://127.0.0.1:8000/api/v1"
 FRAMES = (12, 48, 40)
 
 

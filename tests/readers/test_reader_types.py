@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 from conftest import Scene
-from distributed import Client, LocalCluster
+from distributed import Client
 
 from tract_dask.errors import SourceError
 from tract_dask.readers import open_source
@@ -80,15 +80,6 @@ def test_every_type_is_converted(dtype: str, tmp_path: Path) -> None:
     movie = open_movie(convert(tmp_path / "a.npy", tmp_path / "movie.zarr"))
     np.testing.assert_array_equal(movie.read(0, 5).astype("f8"), pixels.astype("f8"))
     np.testing.assert_allclose(movie.statistics()["frame_mean"], pixels.astype("f8").mean((1, 2)), rtol=1e-6, atol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def client():
-    with (
-        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
-        Client(local) as client,
-    ):
-        yield client
 
 
 def test_whole_runs_find_the_same_columns_in_every_type(client: Client, tmp_path: Path) -> None:

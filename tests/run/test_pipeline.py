@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from conftest import Scene
-from distributed import Client, LocalCluster
+from distributed import Client
 
 from tract_dask.cluster import connect as cluster
 from tract_dask.cluster import tries
@@ -25,15 +25,6 @@ from tract_dask.store import datasets, files, run_folder
 from tract_dask.store.results import open_results
 
 SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1))
-
-
-@pytest.fixture(scope="module")
-def client():
-    with (
-        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
-        Client(local) as client,
-    ):
-        yield client
 
 
 class Job:

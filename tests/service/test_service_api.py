@@ -5,13 +5,12 @@ import dataclasses
 import json
 import threading
 import time
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from serviced import FRAMES, listening, make_app, make_root
+from serviced import FRAMES, URL, listening, make_app
 
 from tract_dask.run.plan import plan_run
 from tract_dask.service import checks
@@ -21,18 +20,6 @@ from tract_dask.service.events import EventStreams
 from tract_dask.service.jobs.states import State
 from tract_dask.service.jobs.store import JobStore
 from tract_dask.settings import RunSettings, from_dict, to_dict
-
-URL = "http://127.0.0.1:8000/api/v1"
-
-
-@pytest.fixture
-def root(tmp_path) -> Path:
-    return make_root(tmp_path / "data")
-
-
-@pytest.fixture
-def api(root) -> TestClient:
-    return TestClient(make_app(root), base_url=URL, raise_server_exceptions=False)
 
 
 def submit(api: TestClient, **more) -> dict:

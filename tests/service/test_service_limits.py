@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi.testclient import TestClient
-from serviced import make_app, make_root
+from serviced import URL, make_app, make_root
 from starving import reserved
 
 from tract_dask.errors import SettingsError, SourceError
@@ -26,19 +26,6 @@ from tract_dask.stages.columns.sites import lattice_columns, settings_lattices
 from tract_dask.stages.drift.stage import read_drift_csv
 from tract_dask.store.columns import MOST_BYTES, MOST_ROWS, parse_columns_csv, read_columns_csv
 from tract_dask.store.files import read_small
-
-URL = "http://127.0.0.1:8000/api/v1"
-
-
-@pytest.fixture
-def root(tmp_path) -> Path:
-    return make_root(tmp_path / "data")
-
-
-@pytest.fixture
-def api(root) -> TestClient:
-    return TestClient(make_app(root), base_url=URL, raise_server_exceptions=False)
-
 
 # --- files that kill their reader ------------------------------------------------------------------------------------
 

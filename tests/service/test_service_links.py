@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from serviced import FRAMES, make_app, make_root
+from serviced import FRAMES, URL, make_app, make_root
 
 from tract_dask.errors import MissingSourceError, TractError
 from tract_dask.progress import ShardDone, StageStarted
@@ -24,7 +24,6 @@ from tract_dask.stages.convert.stage import convert
 from tract_dask.store import metadata
 from tract_dask.store.stamps import Stamps
 
-URL = "http://127.0.0.1:8000/api/v1"
 SHAPE = (4, 48, 40)
 KINDS = ("external", "virtual", "raw", "chain", "nested", "soft")
 
@@ -33,11 +32,6 @@ KINDS = ("external", "virtual", "raw", "chain", "nested", "soft")
 def root(tmp_path) -> Path:
     (tmp_path / "outside").mkdir()
     return make_root(tmp_path / "data")
-
-
-@pytest.fixture
-def api(root) -> TestClient:
-    return TestClient(make_app(root), base_url=URL, raise_server_exceptions=False)
 
 
 def write_target(folder: Path) -> Path:

@@ -12,7 +12,7 @@ from time import monotonic, sleep
 
 import pytest
 from fastapi.testclient import TestClient
-from serviced import make_app, make_root
+from serviced import URL, make_app
 
 from tract_dask.errors import DestinationError, InputError, TractError
 from tract_dask.service.data_root import DataRoot, OutsideError
@@ -25,13 +25,7 @@ from tract_dask.store import metadata
 from tract_dask.store.locks import sole_use
 from tract_dask.store.run_folder import RunFolder
 
-URL = "http://127.0.0.1:8000/api/v1"
 OWNERS = {"ana": "user", "ben": "user", "root": "admin"}
-
-
-@pytest.fixture
-def root(tmp_path) -> Path:
-    return make_root(tmp_path / "data")
 
 
 @pytest.fixture

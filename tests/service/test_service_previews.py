@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from fastapi.testclient import TestClient
 from PIL import Image
-from serviced import make_app
+from serviced import URL, make_app
 
 from tract_dask import convert
 from tract_dask.errors import InputError
@@ -18,7 +18,6 @@ from tract_dask.service.views.pictures import PERCENTILES, Plane, View, encode_p
 from tract_dask.settings import ConvertSettings, MetadataSettings
 from tract_dask.store import datasets
 
-URL = "http://127.0.0.1:8000/api/v1"
 FINE = 8
 """Parts of a pixel: boxes with edges at eighths can be compared with an enlarged image."""
 

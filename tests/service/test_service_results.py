@@ -16,7 +16,7 @@ import xarray as xr
 import zarr.storage
 from conftest import add_fits, store_fits
 from fastapi.testclient import TestClient
-from serviced import Here, make_app
+from serviced import URL, Here, make_app
 
 from tract_dask import open_results
 from tract_dask.analysis import motion
@@ -33,7 +33,6 @@ from tract_dask.store.shards import split
 N_FRAMES, N_COLUMNS, STEP = 23, 6, 4
 PIXEL_PM, FRAME_S = 4.0, 0.1
 KEY = "the key of these fits"
-URL = "http://127.0.0.1:8000/api/v1"
 
 
 class Fits:

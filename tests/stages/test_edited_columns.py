@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Scene
-from distributed import Client, LocalCluster
+from distributed import Client
 
 from tract_dask.errors import DestinationError
 from tract_dask.progress import STAGES, Warned
@@ -20,15 +20,6 @@ from tract_dask.store.results import open_results
 
 SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1))
 KEPT = "was edited: your columns are kept"
-
-
-@pytest.fixture(scope="module")
-def client():
-    with (
-        LocalCluster(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as local,
-        Client(local) as client,
-    ):
-        yield client
 
 
 def change(**groups: dict) -> RunSettings:

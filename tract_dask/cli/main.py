@@ -7,9 +7,9 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import click
 
@@ -22,8 +22,6 @@ from .run import columns, convert, demo, drift, fit, inspect, run
 from .serve import certs, serve, token
 from .show import DEBUG
 from .simulate import simulate
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Group(click.Group):

@@ -11,12 +11,11 @@ import click
 from ..progress import STAGES, RunState
 from ..settings.run import RunSettings
 from .options import Command, setting_options
-from .show import PATH, common_options, show
+from .show import PATH, common_options, exit_for, overwrite_option, progress, show
 
 if TYPE_CHECKING:
     from ..run.pipeline import RunOutcome
     from ..run.plan import Plan
-from .show import exit_for, overwrite_option, progress
 
 drift_option = click.option("--drift-from", type=PATH, help="Drift written by tract-dask drift; unset: no drift.")
 

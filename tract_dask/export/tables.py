@@ -279,9 +279,6 @@ _WRITERS: dict[str, Callable[[xr.Dataset, Path, bool], None]] = {
     ".mat": _write_mat,
 }
 
-SUFFIXES = (*_WRITERS, ".xyz")
-"""What a file may be called."""
-
 
 def _check_package(path: Path) -> None:
     package = _PACKAGES.get(path.suffix.lower())

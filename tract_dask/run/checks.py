@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from ..cluster.connect import local_memory_limit
 from ..errors import DestinationError, InputError, SettingsError, SourceError
-from ..progress import (
-    STAGES,
-)
+from ..progress import STAGES
 from ..readers import open_source
 from ..readers.listing import FileList
 from ..readers.source import FrameSource, Permit

@@ -11,10 +11,7 @@ import xarray as xr
 from distributed import Client
 
 from ..cluster.tries import persist
-from ..progress import (
-    Sink,
-    silent,
-)
+from ..progress import Sink, silent
 from ..settings.run import RunSettings
 from ..stages.columns.stage import check_edited, columns_stage
 from ..stages.convert.stage import convert_stage

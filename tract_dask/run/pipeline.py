@@ -15,17 +15,7 @@ import xarray as xr
 from distributed import Client
 
 from ..cluster.tries import persist
-from ..progress import (
-    REPORT,
-    JsonLines,
-    RunState,
-    Sink,
-    StageDone,
-    StageStarted,
-    Warned,
-    silent,
-    tee,
-)
+from ..progress import REPORT, JsonLines, RunState, Sink, StageDone, StageStarted, Warned, silent, tee
 from ..readers.listing import FileList
 from ..readers.source import FrameSource, Permit
 from ..settings.run import RunSettings

@@ -19,15 +19,7 @@ from ..cluster.connect import LazyClient, memory_budget
 from ..cluster.tls import open_to_others
 from ..cluster.tries import Done, persist
 from ..errors import StoreError
-from ..progress import (
-    Event,
-    RunDone,
-    RunStarted,
-    RunState,
-    Sink,
-    StageDone,
-    Warned,
-)
+from ..progress import Event, RunDone, RunStarted, RunState, Sink, StageDone, Warned
 from ..settings.cluster import ClusterSettings
 from ..store import disk
 from .plan import Plan
@@ -131,9 +123,9 @@ class Record:
 def _get_ready() -> None:
     """Import what the later stages need here, and make the compiler ready to load kernels."""
     from .. import report  # noqa: F401
-    from ..stages.columns import find  # noqa: F401
     from ..kernels.registration import load_kernels
     from ..plots.columns import plot_columns  # noqa: F401
+    from ..stages.columns import find  # noqa: F401
 
     load_kernels()
 

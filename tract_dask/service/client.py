@@ -19,17 +19,16 @@ from time import monotonic, sleep
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-import httpcore  # noqa: F401  httpx would import it with its first client, which two threads may make at once
 import httpx
 
 from ..errors import ClusterError, DestinationError, InputError, ServiceError
 from ..settings.run import RunSettings
+from .client_answers import check_answer, trusting, values_of
 from .jobs.records import PublicJob
 from .jobs.states import AT_REST, State
 
 if TYPE_CHECKING:
     import xarray as xr
-from .client_answers import check_answer, trusting, values_of
 
 API = "/api/v1"
 

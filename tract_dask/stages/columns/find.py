@@ -18,14 +18,12 @@ from ...kernels.magnitude import unit_of
 from ...kernels.peaks import centroids, climb
 from ...settings.run import ColumnSettings
 from ...store import schema
-from ...store.columns import check_inside, column_dataset, positions, read_columns_csv, write_columns_csv
+from ...store.columns import check_inside, column_dataset, positions, read_columns_csv
 from ...store.schema import Status
 from .detect import METHODS, make_detector
 from .lattice import Lattice, Places, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
-from .sites import lattice_columns, lattice_sites
+from .sites import lattice_sites
 from .window_size import neighbour_distance, resolve_window
-
-__all__ = ["find_columns", "lattice_columns", "read_columns_csv", "write_columns_csv"]
 
 _SAME = 1 / 3
 """Seeds nearer than this share of the spacing, after refinement, are one column."""
@@ -80,11 +78,10 @@ def find_columns(
 ) -> xr.Dataset:
     """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
 
-    Seeds come from the image (method ``auto``, see
-    :func:`tract_dask.stages.columns.lattice.find_peaks`), from lattices of three atoms
-    (``lattice``, see :func:`lattice_columns`), from a file (``csv``), or are what stands out of the noise (``maxima``,
-    ``blobs``, ``template``, see :mod:`tract_dask.stages.columns.detect`). Each moves to the local maximum within the
-    search radius, then to the centroid around that, and there Equation 1 is fitted.
+    Seeds come from the image (method ``auto``, see :func:`tract_dask.stages.columns.lattice.find_peaks`), from lattices
+    of three atoms (``lattice``, see :func:`tract_dask.lattice_columns`), from a file (``csv``), or are what stands out
+    of the noise (``maxima``, ``blobs``, ``template``, see :mod:`tract_dask.stages.columns.detect`). Each moves to the
+    local maximum within the search radius, then to the centroid around that, and there Equation 1 is fitted.
 
     Parameters
     ----------

@@ -13,9 +13,7 @@ import xarray as xr
 from distributed import Client
 
 from ...errors import SettingsError, SourceError
-from ...kernels.registration import (
-    Floats,
-)
+from ...kernels.registration import Floats
 from ...progress import Sink, StageDone, StageStarted, silent
 from ...settings.run import DriftSettings
 from ...store.files import read_small
