@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from test_readers import N_FRAMES, N_X, N_Y, UNDECLARED, movie
 
 from tract_dask.errors import SettingsError, SourceError, TractError
-from tract_dask.readers import READERS, open_source
+from tract_dask.readers import READERS, Reader, open_source
 from tract_dask.settings import SourceSettings
 
 
@@ -235,7 +235,7 @@ def test_hdf5_paths(tmp_path: Path) -> None:
     fails(tmp_path / "empty.h5", "a file without data sets")
     fails(f"{tmp_path / 'movie.tif'}::/a", "no such file")
     np.save(tmp_path / "movie.npy", movie())
-    fails(f"{tmp_path / 'movie.npy'}::/a", "only HDF5 files have paths inside")
+    fails(f"{tmp_path / 'movie.npy'}::/a", "NumPy files have no paths inside")
 
 
 def test_hdf5_with_a_filter_that_is_not_here(tmp_path: Path) -> None:
@@ -501,7 +501,7 @@ def test_whatever_a_library_raises_is_an_error_of_ours(
     with pytest.raises(SourceError, match=r"movie\.tif") as caught:
         source.read(0, 1)
     assert caught.value.__cause__ is error
-    monkeypatch.setitem(READERS, ".tif", broken)
+    monkeypatch.setitem(READERS, ".tif", Reader("TIFF", (".tif",), broken))
     fails(tmp_path / "movie.tif")
 
 

@@ -1,18 +1,20 @@
 """Readers: one file a format behind one small protocol.
 
-A format is a function from a path to a :class:`~tract_dask.readers.source.Source` and its line in :data:`READERS`.
+A format is a function from a path to a :class:`~tract_dask.readers.source.Source` and its line in :data:`BUILT_IN`.
+Other packages add a :class:`~tract_dask.readers.registry.Reader` by an entry point of the group ``tract_dask.readers``.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from importlib.metadata import entry_points
 from itertools import chain
 from pathlib import Path
-from typing import TypeAlias
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
@@ -21,6 +23,7 @@ from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
+from .registry import Reader, by_suffix
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
@@ -30,34 +33,49 @@ __all__ = [
     "FileList",
     "FrameSource",
     "Permit",
+    "Reader",
     "SourceMetadata",
     "files_named_now",
+    "is_movie_folder",
     "list_files",
     "open_cached",
     "open_source",
     "unknown_format",
 ]
 
-Opener: TypeAlias = Callable[[Path, str, SourceSettings], Source]
-"""Takes a file, the path inside it (HDF5 only), and how to read it; makes every check."""
+BUILT_IN = (
+    Reader("TIFF", (".tif", ".tiff"), open_tiff),
+    Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc),
+    Reader("NumPy", (".npy",), open_npy),
+    Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
+    Reader("raw", (".raw", ".bin", ".dat"), open_raw),
+)
+"""The formats that are read here."""
 
-READERS: dict[str, Opener] = {
-    ".tif": open_tiff,
-    ".tiff": open_tiff,
-    ".mrc": open_mrc,
-    ".mrcs": open_mrc,
-    ".st": open_mrc,
-    ".npy": open_npy,
-    ".h5": open_hdf5,
-    ".hdf5": open_hdf5,
-    ".hspy": open_hdf5,
-    ".raw": open_raw,
-    ".bin": open_raw,
-    ".dat": open_raw,
-}
+
+def _of_others() -> list[Reader]:
+    """Return the readers of other packages; one that cannot be loaded is a warning, and its format stays unknown."""
+    found = []
+    for entry in entry_points(group="tract_dask.readers"):
+        try:
+            reader = entry.load()
+        except Exception as error:  # noqa: BLE001 - whatever another package does when it is imported
+            warnings.warn(f"the reader {entry.name} ({entry.value}) cannot be loaded: {error}", stacklevel=2)
+            continue
+        if isinstance(reader, Reader):
+            found.append(reader)
+        else:
+            warnings.warn(f"the entry point {entry.name} ({entry.value}) is no Reader", stacklevel=2)
+    return found
+
+
+READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
+"""The reader of each suffix."""
 
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
+
+_RAW = READERS[".raw"]
 
 _VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
 
@@ -103,12 +121,12 @@ def open_source(
     with reading(name):
         source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
     known = source.metadata
-    merged = SourceMetadata(
+    merged = replace(
+        known,
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
         frame_time_s=known.frame_time_s if metadata.frame_time_s is None else metadata.frame_time_s,
-        dose=metadata.dose,
+        dose=known.dose if metadata.dose is None else metadata.dose,
         gain=metadata.gain,
-        notes=known.notes,
     )
     listed = tuple(place) if isinstance(place, list) else ()
     return replace(source, path=name, metadata=merged, listed=listed, permit=permit)
@@ -148,8 +166,19 @@ def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None)
     name = str(path)
     outer, inner = _split(name)
     open_file = partial(_open_file, inner=inner, settings=settings, permit=permit)
+    if not isinstance(path, FileList) and (reader := _reader_of_folder(Path(outer))):
+        return _opened(reader, Path(outer), inner, settings, permit)
     listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
     return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
+
+
+def is_movie_folder(place: Path) -> bool:
+    """Tell whether a folder is one movie by itself, such as a Zarr array; of a folder of files each may be one."""
+    return _reader_of_folder(place) is not None
+
+
+def _reader_of_folder(place: Path) -> Reader | None:
+    return next((reader for reader in READERS.values() if reader.is_movie(place)), None) if place.is_dir() else None
 
 
 def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, ...]] | None:
@@ -197,21 +226,24 @@ def _split(name: str) -> tuple[str, str]:
 
 def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
     checked_file(path, permit)
-    suffix = path.suffix.lower()
     declared = settings.raw_shape is not None and settings.raw_dtype is not None
-    opener = READERS.get(suffix, open_raw if declared else None)
-    if opener is None:
+    reader = READERS.get(path.suffix.lower(), _RAW if declared else None)
+    if reader is None:
         raise unknown_format(path)
-    if inner and opener is not open_hdf5:
+    return _opened(reader, path, inner, settings, permit)
+
+
+def _opened(reader: Reader, path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
+    if inner and not reader.inside:
         raise SourceError(
-            "only HDF5 files have paths inside",
+            f"{reader.name} files have no paths inside",
             f"{path}::{inner}",
             "the file's name alone",
             f"the path {inner}",
             f"Open {path}",
         )
     with reading(str(path)):
-        return open_hdf5(path, inner, settings, permit=permit) if opener is open_hdf5 else opener(path, inner, settings)
+        return reader.open(path, inner, settings, permit)
 
 
 def unknown_format(path: Path) -> SourceError:

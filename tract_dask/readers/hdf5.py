@@ -93,7 +93,7 @@ class RawPixelSource(Source):
         return widened(frames, self.dtype)
 
 
-def open_hdf5(path: Path, inner: str, settings: SourceSettings, *, permit: Permit | None = None) -> Source:
+def open_hdf5(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
     """Open a data set of an HDF5 file; where only one has three axes, ``inner`` may be empty.
 
     Raises

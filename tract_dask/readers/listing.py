@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..errors import SourceError
+from .registry import Reader
 from .sequence import natural_key
 
 WILD = "*?["
@@ -37,7 +37,7 @@ class FileList:
         return self.name
 
 
-def list_files(name: str, outer: Path, readers: Mapping[str, Any]) -> FileList | None:
+def list_files(name: str, outer: Path, readers: Mapping[str, Reader]) -> FileList | None:
     """Return the files that a folder or a pattern names; None where ``outer`` is one file.
 
     A path that exists is never a pattern, and only its last part may be one: the folder is taken as it is written.
@@ -90,9 +90,10 @@ def _matching(pattern: Path) -> list[Path]:
     return [pattern.parent / name for name in names if name.startswith(".") <= pattern.name.startswith(".")]
 
 
-def _readable(folder: Path, readers: Mapping[str, Any]) -> list[Path]:
-    """Return the files of the one readable format in a folder."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in readers and not file.name.startswith(".")]
+def _readable(folder: Path, readers: Mapping[str, Reader]) -> list[Path]:
+    """Return the files of the one readable format in a folder, without those that only belong to another one."""
+    there = [file for file in folder.iterdir() if file.suffix.lower() in readers and not file.name.startswith(".")]
+    files = [file for file in there if not readers[file.suffix.lower()].is_part(file)]
     kinds = Counter(file.suffix.lower() for file in files)
     if len({readers[kind] for kind in kinds}) > 1:
         raise SourceError(

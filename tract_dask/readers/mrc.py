@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, open_block
-from .source import SourceMetadata
+from .source import Permit, SourceMetadata
 from .units import square_pixel, to_pm
 
 _HEADER_BYTES = 1024
@@ -22,7 +22,7 @@ _DEFAULT_VOXEL = 100.0
 """One angstrom, in pm: what programs write that know nothing."""
 
 
-def open_mrc(path: Path, inner: str, settings: SourceSettings) -> BlockSource:
+def open_mrc(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> BlockSource:
     """Open an MRC stack: sections are frames, the voxel size is the pixel size.
 
     Raises

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import open_block
-from .source import Frames, Source, SourceMetadata, checked_dtype, checked_shape, truncated, widened
+from .source import Frames, Permit, Source, SourceMetadata, checked_dtype, checked_shape, truncated, widened
 
 _HEADER_BYTES = 10_000
 """NumPy, too, parses no longer header."""
@@ -45,7 +45,7 @@ class FortranSource(Source):
         return widened(np.array(frames, order="C"), self.dtype)
 
 
-def open_npy(path: Path, inner: str, settings: SourceSettings) -> Source:
+def open_npy(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
     """Open a .npy file.
 
     Raises

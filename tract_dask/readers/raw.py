@@ -10,10 +10,10 @@ import numpy as np
 from ..errors import SettingsError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, open_block
-from .source import SourceMetadata
+from .source import Permit, SourceMetadata
 
 
-def open_raw(path: Path, inner: str, settings: SourceSettings) -> BlockSource:
+def open_raw(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> BlockSource:
     """Open a raw binary file.
 
     Raises

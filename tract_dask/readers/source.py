@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -31,6 +31,22 @@ def check_permitted(permit: Permit | None, files: Sequence[Path]) -> None:
         permit(Path(os.path.realpath(file)))
 
 
+@dataclass(frozen=True, eq=False)
+class FrameValues:
+    """One number for each frame, as the headers of the frames have it.
+
+    Attributes
+    ----------
+    values
+        (frames,) float64; NaN where a frame does not say.
+    units
+        Such as ``s``, ``degC``, ``deg``, ``V``.
+    """
+
+    values: NDArray[np.float64]
+    units: str
+
+
 @dataclass(frozen=True)
 class SourceMetadata:
     """What is known about a movie beside its pixels; None where neither the file nor the user says.
@@ -47,6 +63,10 @@ class SourceMetadata:
         Electron counts for one detector unit.
     notes
         Sentences that the user should read, such as one on a gap in a sequence.
+    along_frames
+        What each frame says of itself, by name: ``time`` (s, from the first frame on), ``temperature`` and others.
+    references
+        Files of the detector that lie beside the movie, by what they are: ``dark``, ``gain``, ``defects``.
     """
 
     pixel_size_pm: float | None = None
@@ -54,6 +74,8 @@ class SourceMetadata:
     dose: float | None = None
     gain: float = 1.0
     notes: tuple[str, ...] = ()
+    along_frames: Mapping[str, FrameValues] = field(default_factory=dict)
+    references: Mapping[str, Path] = field(default_factory=dict)
 
 
 NOTHING_KNOWN = SourceMetadata()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource
-from .source import Frames, Source, checked_claim, checked_dtype, checked_shape, truncated, widened, words
+from .source import Frames, Permit, Source, checked_claim, checked_dtype, checked_shape, truncated, widened, words
 from .tiff_codecs import CODECS, PART_BYTES, check_codestreams
 from .tiff_metadata import Description, parse_description
 from .tiff_pages import Page, walk
@@ -57,7 +57,7 @@ class PagedSource(Source):
         return frames
 
 
-def open_tiff(path: Path, inner: str, settings: SourceSettings) -> Source:
+def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
     """Open a TIFF whose pages, all of one shape and type, are the frames.
 
     Raises

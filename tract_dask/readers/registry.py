@@ -1,0 +1,51 @@
+"""What a format is here: a name, suffixes, and a function that opens a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from ..settings.run import SourceSettings
+from .source import Permit, Source
+
+Opener: TypeAlias = Callable[[Path, str, SourceSettings, Permit | None], Source]
+"""Takes a file or folder, the path inside it, how to read it, and what to ask before other files; makes every check."""
+
+
+def _never(path: Path) -> bool:
+    return False
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A format.
+
+    Attributes
+    ----------
+    name
+        The format's name, for people.
+    suffixes
+        Of its files, in lower case and with the dot.
+    open
+        Opens a movie.
+    inside
+        What may follow a path after two colons, in words; empty where nothing may.
+    is_movie
+        Tells whether a folder is one movie of this format, which ``open`` takes as a whole.
+    is_part
+        Tells whether a file, whose suffix is one of these, only belongs to the movie of another file beside it.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    open: Opener
+    inside: str = ""
+    is_movie: Callable[[Path], bool] = _never
+    is_part: Callable[[Path], bool] = _never
+
+
+def by_suffix(readers: Iterable[Reader]) -> dict[str, Reader]:
+    """Return readers by the suffixes of their files; an earlier one keeps a suffix that a later one has, too."""
+    return {suffix: reader for reader in reversed(tuple(readers)) for suffix in reader.suffixes}

@@ -1,0 +1,63 @@
+"""The times of frames, from the stamps that cameras write."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .source import FrameValues, SourceMetadata
+
+_LOST = 1.5
+"""A step so many times the usual one is a gap, in which frames were lost."""
+
+
+def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
+    """Return times and frame time of frames by their time stamps; the frame time is the median step.
+
+    Parameters
+    ----------
+    stamps_s
+        (frames,) seconds since any moment.
+    where
+        The file, for notes.
+
+    Returns
+    -------
+    SourceMetadata
+        With ``time`` along the frames and ``frame_time_s``; a note where frames were lost. Of stamps that are not
+        finite, or do not grow, there is only a note.
+
+    Examples
+    --------
+    >>> timed([5.0, 5.5, 6.5, 7.0], "a.seq").frame_time_s
+    0.5
+    >>> timed([5.0, 5.5, 6.5, 7.0], "a.seq").notes
+    ('a.seq: the time stamps have a gap of 1 s after frame 1, where a frame takes 0.5 s; the times of frames show it',)
+    """
+    stamps = np.asarray(stamps_s, np.float64)
+    if len(stamps) < 2:
+        return SourceMetadata()
+    steps = np.diff(stamps)
+    if not np.isfinite(stamps).all() or not (steps > 0).all():
+        return SourceMetadata(notes=_unfit(stamps, steps, where))
+    usual = float(f"{np.median(steps):.9g}")
+    along = {"time": FrameValues(np.round(stamps - stamps[0], 9), "s")}
+    return SourceMetadata(frame_time_s=usual, notes=_gaps(steps, usual, where), along_frames=along)
+
+
+def _unfit(stamps: NDArray[np.float64], steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
+    if not np.any(stamps):
+        return ()  # a header that was left empty
+    bad = int(np.argmax(~(steps > 0))) + 1
+    return (f"{where}: the time stamps of its frames do not grow (first at frame {bad}); they are not used",)
+
+
+def _gaps(steps: NDArray[np.float64], usual: float, where: str) -> tuple[str, ...]:
+    wide = np.flatnonzero(steps > _LOST * usual)
+    if not len(wide):
+        return ()
+    more = f" (and {len(wide) - 1} more)" if len(wide) > 1 else ""
+    return (
+        f"{where}: the time stamps have a gap of {steps[wide[0]]:.6g} s after frame {wide[0]}{more}, where a frame"
+        f" takes {usual:.6g} s; the times of frames show it",
+    )
