@@ -41,11 +41,8 @@ def deadly(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     for module in (*sys.modules.values(),):
         if getattr(module, "__name__", "").startswith("tract_dask") and hasattr(module, "READERS"):
-            patch.setattr(
-                module,
-                "READERS",
-                module.READERS | dict.fromkeys((".crash", ".hang", ".starve"), Reader("deadly", (), open)),
-            )
+            made_up = dict.fromkeys((".crash", ".hang", ".starve"), Reader("made up", (), open))
+            patch.setattr(module, "READERS", module.READERS | made_up)
     app.state.services.pool = ProcessPool(2, memory=512 << 20, imported=("starving",))
     yield TestClient(app, base_url=URL, raise_server_exceptions=False)
     app.state.services.pool.close()

@@ -65,7 +65,7 @@ def _of_others() -> list[Reader]:
         if isinstance(reader, Reader):
             found.append(reader)
         else:
-            warnings.warn(f"the entry point {entry.name} ({entry.value}) is no Reader", stacklevel=2)
+            warnings.warn(f"the entry point {entry.name} ({entry.value}) does not name a Reader", stacklevel=2)
     return found
 
 
