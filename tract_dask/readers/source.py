@@ -63,6 +63,8 @@ class SourceMetadata:
         Electron counts for one detector unit.
     notes
         Sentences that the user should read, such as one on a gap in a sequence.
+    start_s
+        When the first frame began, in seconds since 1970; for files that are parts of one movie.
     along_frames
         What each frame says of itself, by name: ``time`` (s, from the first frame on), ``temperature`` and others.
     references
@@ -74,6 +76,7 @@ class SourceMetadata:
     dose: float | None = None
     gain: float = 1.0
     notes: tuple[str, ...] = ()
+    start_s: float | None = None
     along_frames: Mapping[str, FrameValues] = field(default_factory=dict)
     references: Mapping[str, Path] = field(default_factory=dict)
 

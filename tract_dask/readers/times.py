@@ -25,7 +25,7 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     -------
     SourceMetadata
         With ``time`` along the frames and ``frame_time_s``; a note where frames were lost. Of stamps that are not
-        finite, or do not grow, there is only a note.
+        finite, or do not grow, there is only a note. ``start_s`` is the first stamp, also where it is the only one.
 
     Examples
     --------
@@ -36,13 +36,14 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     """
     stamps = np.asarray(stamps_s, np.float64)
     if len(stamps) < 2:
-        return SourceMetadata()
+        return SourceMetadata(start_s=float(stamps[0]) if np.isfinite(stamps).all() and stamps.any() else None)
     steps = np.diff(stamps)
     if not np.isfinite(stamps).all() or not (steps > 0).all():
         return SourceMetadata(notes=_unfit(stamps, steps, where))
     usual = float(f"{np.median(steps):.9g}")
     along = {"time": FrameValues(np.round(stamps - stamps[0], 9), "s")}
-    return SourceMetadata(frame_time_s=usual, notes=_gaps(steps, usual, where), along_frames=along)
+    notes = _gaps(steps, usual, where)
+    return SourceMetadata(frame_time_s=usual, notes=notes, start_s=float(stamps[0]), along_frames=along)
 
 
 def _unfit(stamps: NDArray[np.float64], steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
