@@ -24,6 +24,7 @@ from ..kernels.gaussian.intensity import Floats
 from ..store import disk, files, metadata, results, schema
 from ..store.run_folder import RunFolder
 from ..store.schema import REJECTED
+from ..store.source_pixels import in_source_pixels
 
 ROWS = 1 << 17
 """Rows that are in memory at a time."""
@@ -81,11 +82,11 @@ def export(
 
 
 def open_tracks(source: str | Path | xr.Dataset) -> xr.Dataset:
-    """Return the Dataset of a results.zarr, or of the folder of a run that holds one."""
+    """Return the Dataset of a results.zarr, or of the folder of a run; in pixels of the movie on disk."""
     if isinstance(source, xr.Dataset):
-        return source
+        return in_source_pixels(source)
     inside = RunFolder(Path(source)).results
-    return results.open_results(inside if inside.exists() else source)
+    return in_source_pixels(results.open_results(inside if inside.exists() else source))
 
 
 def table(tracks: xr.Dataset) -> pd.DataFrame:
@@ -114,7 +115,8 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
     scale = tracks.attrs.get("pixel_size_pm")
     for axis in ("x", "y") if scale else ():
         columns[f"{axis}_pm"] = scale * tracks["fit"].sel(parameter=axis).to_numpy().ravel()
-    for name in map(str, tracks.data_vars):
+    said = [str(name) for name, of in tracks.coords.items() if of.dims == ("frame",) and name not in columns]
+    for name in [*said, *map(str, tracks.data_vars)]:
         if name not in columns and "frame" in tracks[name].dims and "place" not in tracks[name].dims:
             columns |= _flat(name, tracks[name], n_columns)
     columns["accepted"] = ((tracks["status"] & np.uint8(REJECTED)) == 0).to_numpy().ravel()

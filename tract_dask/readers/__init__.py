@@ -76,6 +76,8 @@ READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
 
+_NOT_APPLIED = "{} beside the movie is the detector's {} reference by its name; it is not applied to the frames"
+
 _RAW = READERS[".raw"]
 
 _VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
@@ -128,6 +130,7 @@ def open_source(
         frame_time_s=known.frame_time_s if metadata.frame_time_s is None else metadata.frame_time_s,
         dose=known.dose if metadata.dose is None else metadata.dose,
         gain=metadata.gain,
+        notes=known.notes + tuple(_NOT_APPLIED.format(file.name, kind) for kind, file in known.references.items()),
     )
     listed = tuple(place) if isinstance(place, list) else ()
     return select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)

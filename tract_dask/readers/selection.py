@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import SettingsError
 from ..settings.run import SourceSettings
-from .source import Frames, FrameValues, Source, SourceMetadata
+from .source import Frames, FrameValues, Part, Source, SourceMetadata
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,6 +205,7 @@ def _metadata(
         frame_time_s=seconds and seconds * frames.step,
         notes=(*known.notes, *_said(frames, field, settings, shape)),
         along_frames=along,
+        part=Part(frames.start, frames.step, field[0], field[2], settings.bin),
     )
 
 

@@ -48,6 +48,27 @@ class FrameValues:
 
 
 @dataclass(frozen=True)
+class Part:
+    """Which part of the frames on disk a movie is.
+
+    Attributes
+    ----------
+    first_frame, frame_step
+        Frame k of the part is frame ``first_frame + k * frame_step`` on disk.
+    top, left
+        Row and column, on disk, of the part's first pixel.
+    bin_px
+        Side of the squares whose pixels are summed.
+    """
+
+    first_frame: int = 0
+    frame_step: int = 1
+    top: int = 0
+    left: int = 0
+    bin_px: int = 1
+
+
+@dataclass(frozen=True)
 class SourceMetadata:
     """What is known about a movie beside its pixels; None where neither the file nor the user says.
 
@@ -67,6 +88,8 @@ class SourceMetadata:
         When the first frame began, in seconds since 1970; for files that are parts of one movie.
     along_frames
         What each frame says of itself, by name: ``time`` (s, from the first frame on), ``temperature`` and others.
+    part
+        Which part of the movie is read; None: all of it.
     references
         Files of the detector that lie beside the movie, by what they are: ``dark``, ``gain``, ``defects``.
     """
@@ -78,6 +101,7 @@ class SourceMetadata:
     notes: tuple[str, ...] = ()
     start_s: float | None = None
     along_frames: Mapping[str, FrameValues] = field(default_factory=dict)
+    part: Part | None = None
     references: Mapping[str, Path] = field(default_factory=dict)
 
 

@@ -12,6 +12,7 @@ import xarray as xr
 
 from ..errors import StoreError
 from ..readers import open_source
+from ..readers.source import SourceMetadata
 from ..settings.run import RunSettings
 from ..store import datasets, metadata
 from ..store.movie import open_movie
@@ -53,8 +54,21 @@ def _source(path: str, settings: RunSettings) -> dict[str, Any]:
             "frame time, s": known.frame_time_s,
             "dose, e/A^2": known.dose,
             "gain": known.gain,
+            **_along_frames(known),
+            **{f"{kind} reference": str(file) for kind, file in known.references.items()},
             "notes": list(known.notes),
         }
+
+
+def _along_frames(known: SourceMetadata) -> dict[str, str]:
+    """Return what the headers of the frames say: the first and the last, and the range of what varies."""
+    found = {}
+    for name, of in known.along_frames.items():
+        low, high = np.nanmin(of.values), np.nanmax(of.values)
+        found[f"{name} of frames, {of.units}"] = f"{of.values[0]:.6g} to {of.values[-1]:.6g}" + (
+            f" (from {low:.6g} to {high:.6g})" if (low, high) != (of.values[0], of.values[-1]) else ""
+        )
+    return found
 
 
 def _movie(path: Path) -> dict[str, Any]:

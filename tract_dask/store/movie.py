@@ -206,6 +206,12 @@ class Movie:
         """Return the per-frame statistics (``schema.STATISTICS``) on ``t``, in memory."""
         return datasets.open_dataset(self.path, only=tuple(schema.STATISTICS))
 
+    @property
+    def part(self) -> dict[str, int] | None:
+        """Which part of its source the movie is, as :class:`tract_dask.readers.source.Part` says; None: all of it."""
+        part: dict[str, int] | None = metadata.attributes(self.path).get("part")
+        return part
+
     def times(self) -> NDArray[np.float64]:
         """Return the start of each frame (frames,) in s; the frame's number where the frame time is not known."""
         return np.asarray(datasets.open_dataset(self.path, only=("t",))["t"].to_numpy(), np.float64)

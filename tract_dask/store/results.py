@@ -253,9 +253,15 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     if not about.get("complete"):
         dataset = _grown(dataset, path)
     dataset.attrs |= {name: about.get(name) for name in _SCALES}
+    dataset.attrs |= part_attributes(about.get("part"))
     settings = from_toml(FitSettings, about["settings"], str(path))
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
     return dataset
+
+
+def part_attributes(part: Mapping[str, int] | None) -> dict[str, int]:
+    """Return which part of its source a movie is, as attributes of its tracks; none where it is all of it."""
+    return {f"source_{name}": number for name, number in (part or {}).items()}
 
 
 def _grown(dataset: xr.Dataset, path: Path) -> xr.Dataset:

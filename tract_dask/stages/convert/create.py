@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,7 @@ def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known:
         "chunk": layout.chunk,
         "bins": layout.bins,
         "frame_values": list(known.along_frames),
+        "part": known.part and asdict(known.part),
     }
     write_metadata(aside, about | plan | quantities(known))
     disk.place_folder(aside, path)

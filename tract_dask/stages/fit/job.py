@@ -61,6 +61,7 @@ class Job:
             movie.frame_values(),
             **provenance(key, self.settings, str(movie.path)),
             **calibration(movie),
+            part=movie.part,
             window=self.window_px,
             vacuum=self.vacuum,
             reference_blur_px=self.reference_blur_px,
