@@ -76,7 +76,7 @@ READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
 
-_NOT_APPLIED = "{} beside the movie is the detector's {} reference by its name; it is not applied to the frames"
+_NOT_APPLIED = "{} next to the movie is the {} reference of its detector, by its name; it is not applied to the frames"
 
 _RAW = READERS[".raw"]
 
