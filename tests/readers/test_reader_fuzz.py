@@ -13,6 +13,7 @@ import mrcfile
 import numpy as np
 import pytest
 import tifffile
+from files_video import write_video
 
 from tract_dask.errors import TractError
 from tract_dask.readers import open_source
@@ -126,6 +127,9 @@ BASES: dict[str, Callable[[Path], object]] = {
     "links.h5": links,
     "emd.h5": emd,
     "movie.hspy": hyperspy,
+    "raw.avi": lambda path: write_video(path, FRAMES.astype("u1"), "rawvideo"),
+    "h264.mp4": lambda path: write_video(path, FRAMES.astype("u1"), "libx264", "yuv420p"),
+    "png.mov": lambda path: write_video(path, FRAMES.astype("u1"), "png"),
     "movie.raw": lambda path: path.write_bytes(FRAMES.tobytes()),
 }
 HOSTILE = (0, 1, 2, 3, 7, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1)

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from files_video import write_video
 
 from tract_dask.errors import InputError, SourceError
 from tract_dask.readers import READERS, open_cached, open_source
@@ -38,6 +39,8 @@ def write(path: Path) -> Path:
         tifffile.imwrite(path, FRAMES, photometric="minisblack", compression="zlib" if suffix == ".tiff" else None)
     elif suffix == ".npy":
         np.save(path, FRAMES)
+    elif suffix in (".avi", ".mp4", ".mov"):
+        write_video(path, FRAMES.astype("u1"), "png")
     elif suffix in (".h5", ".hdf5", ".hspy"):
         with h5py.File(path, "w") as file:
             file["data"] = FRAMES

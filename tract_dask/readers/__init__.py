@@ -18,6 +18,7 @@ from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
+from . import video
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
@@ -49,6 +50,7 @@ BUILT_IN = (
     Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc),
     Reader("NumPy", (".npy",), open_npy),
     Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
+    Reader("video", video.SUFFIXES, video.open_video),
     Reader("raw", (".raw", ".bin", ".dat"), open_raw),
 )
 """The formats that are read here."""

@@ -1,0 +1,165 @@
+"""Grey videos (AVI, MP4, MOV), decoded by PyAV, which is an optional package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, SourceError
+from ..settings.run import SourceSettings
+from .source import Frames, Permit, Source, SourceMetadata, checked_claim, checked_shape
+from .times import timed
+
+SUFFIXES = (".avi", ".mp4", ".mov")
+
+_LOSSLESS = ("rawvideo", "ffv1", "huffyuv", "ffvhuff", "utvideo", "png", "v210", "zlib", "qtrle")
+"""Codecs whose pixels are those that the camera gave."""
+
+_DEEP = ("gray16le", "gray16be")
+
+_COLOUR = 3
+"""Red, green and blue of a grey picture differ by no more: what rounding in other spaces of colour leaves."""
+
+_EMPTY = -(2**63)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VideoSource(Source):
+    """Frames of a video, decoded from the key frame before them.
+
+    Attributes
+    ----------
+    stamps
+        (frames,) presentation times in units of the stream, ascending.
+    keys
+        Those of the frames from which decoding can begin.
+    pixels
+        Name of the pixel format that frames are converted to.
+    """
+
+    stamps: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    pixels: str
+
+    def _read(self, start: int, stop: int) -> Frames:
+        frames = np.empty((stop - start, *self.shape[1:]), self.dtype)
+        found = np.zeros(stop - start, bool)
+        for number, frame in self._decoded(start, stop):
+            frames[number - start] = frame.to_ndarray(format=self.pixels)
+            found[number - start] = True
+        if not found.all():
+            raise SourceError(
+                f"frame {start + int(np.argmin(found))} of the video cannot be decoded",
+                self.path,
+                remedy="Make the copy or the export again",
+            )
+        return frames
+
+    def _decoded(self, start: int, stop: int) -> Iterator[tuple[int, Any]]:
+        """Yield the frames from ``start`` to ``stop`` (not included) with their numbers."""
+        av = _package(self.path)
+        with av.open(str(self.files[0]), metadata_errors="ignore") as container:
+            stream = container.streams.video[0]
+            key = self.keys[max(0, int(np.searchsorted(self.keys, self.stamps[start], side="right")) - 1)]
+            container.seek(int(key), stream=stream, backward=True)
+            for frame in container.decode(stream):
+                number = int(np.searchsorted(self.stamps, frame.pts if frame.pts is not None else _EMPTY))
+                if number >= stop or number >= len(self.stamps):
+                    return
+                if number >= start and self.stamps[number] == frame.pts:
+                    yield number, frame
+
+
+def open_video(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> VideoSource:
+    """Open the video of a file whose frames are grey.
+
+    Raises
+    ------
+    InputError
+        Where PyAV is not installed.
+    SourceError
+        Where there is no video in it, it cannot be decoded, or it has colours.
+    """
+    av = _package(str(path))
+    size = path.stat().st_size
+    with av.open(str(path), metadata_errors="ignore") as container:
+        if not container.streams.video:
+            raise SourceError("there is no video in this file", str(path), remedy="Name the movie's file")
+        stream = container.streams.video[0]
+        shape = (stream.codec_context.height, stream.codec_context.width)
+        checked_claim(shape[0] * shape[1], size, str(path))
+        packets = sorted((packet.pts, bool(packet.is_keyframe)) for packet in container.demux(stream) if packet.size)
+        stamps = np.array([pts for pts, _ in packets if pts is not None], np.int64)
+        codec, kind, base = stream.codec_context.name, stream.codec_context.pix_fmt or "", float(stream.time_base or 0)
+        container.seek(0, stream=stream)
+        first = next(container.decode(stream), None)
+        if first is None or len(stamps) < len(packets) or len(np.unique(stamps)) < len(stamps):
+            raise SourceError(
+                "the frames of the video cannot be told apart",
+                str(path),
+                "a time for each frame",
+                f"{len(packets)} frames with {len(np.unique(stamps))} times",
+                "Export the movie as TIFF or MRC",
+            )
+        _check_grey(first, path)
+        shape = (first.height, first.width)
+    deep = kind in _DEEP
+    return VideoSource(
+        path=str(path),
+        files=(path,),
+        format=f"video ({codec})",
+        shape=checked_shape((len(stamps), *shape), str(path)),
+        dtype=np.dtype("u2" if deep else "u1"),
+        metadata=_noted(timed(stamps * base, path.name), path.name, codec),
+        stamps=stamps,
+        keys=np.array([pts for pts, is_key in packets if is_key] or [stamps[0]], np.int64),
+        pixels="gray16le" if deep else "gray",
+    )
+
+
+def _package(where: str) -> Any:
+    """Return PyAV.
+
+    Raises
+    ------
+    InputError
+        Where it is not installed.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise InputError(
+            "videos are read by PyAV, which is not installed",
+            where,
+            remedy='Say: pip install "tract_dask[video]"; or export the movie as TIFF or MRC',
+        ) from error
+    return av
+
+
+def _check_grey(frame: Any, path: Path) -> None:
+    """Refuse a video with colours."""
+    colours = frame.to_ndarray(format="rgb24").astype(np.int16)
+    if int(np.ptp(colours, axis=2).max()) > _COLOUR:
+        raise SourceError(
+            "the pixels are RGB colours",
+            str(path),
+            "a grey video",
+            "colours in its first frame",
+            "Export the grey frames as TIFF or MRC, without overlays",
+        )
+
+
+def _noted(known: SourceMetadata, name: str, codec: str) -> SourceMetadata:
+    """Return what is known of a video; a note where its compression has changed the pixels."""
+    if codec in _LOSSLESS:
+        return known
+    note = (
+        f"{name} is compressed by {codec}, which changes the pixels: noise, errors and intensities that are computed"
+        " from them are not to be trusted; take the camera's own file where there is one"
+    )
+    return replace(known, notes=(*known.notes, note))
