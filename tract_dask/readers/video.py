@@ -71,7 +71,7 @@ class VideoSource(Source):
                 number = int(np.searchsorted(self.stamps, frame.pts if frame.pts is not None else _EMPTY))
                 if number >= stop or number >= len(self.stamps):
                     return
-                if number >= start and self.stamps[number] == frame.pts:
+                if number >= start and self.stamps[number] == frame.pts and not frame.is_corrupt:
                     yield number, frame
 
 
