@@ -136,7 +136,9 @@ def write_seq(
     for k, frame in enumerate(frames):
         time = stamps_us[k] if stamps_us else 1_700_000_000_000_000 + 40_000 * k
         stamp = struct.pack("<IHH", time // 1_000_000, time // 1000 % 1000, time % 1000)
-        body += (np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).tobytes() + stamp).ljust(stride, b"\0")[:stride]
+        body += (np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).tobytes() + stamp).ljust(stride, b"\0")[
+            :stride
+        ]
     path.write_bytes(head.ljust(8192 if version >= 5 else 1024, b"\0") + body)
     return path
 

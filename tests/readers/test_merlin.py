@@ -79,7 +79,7 @@ def test_the_hdr_file_beside_it(tmp_path: Path) -> None:
     asked: list[Path] = []
     path = write_mib(tmp_path / "scan [2].mib", DEEP.astype("u2"))
     header = write_hdr(tmp_path / "scan [2].hdr", 3)
-    for place in (header, path, tmp_path):
+    for place in (header, path, tmp_path, f"{tmp_path}/scan*"):
         source = open_source(place, permit=asked.append)
         assert (source.files, source.metadata.notes) == ((path,), ())
         np.testing.assert_array_equal(source.read(0, 3), DEEP.astype("u2"))

@@ -1,5 +1,6 @@
 """StreamPix sequences: versions, time stamps, references beside them, and what is refused by name."""
 
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -109,3 +110,10 @@ def test_damage(tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(SourceError, match=words):
             open_source(path)
+
+
+def test_a_damaged_stride_that_makes_billions_of_frames(tmp_path: Path) -> None:
+    path = write_seq(tmp_path / "a.seq", FRAMES[:, :1, :1].astype("u1"), padding=0)
+    os.truncate(path, 2**31)  # a sparse file
+    with pytest.raises(SourceError, match="number of frames is impossible"):
+        open_source(path)

@@ -1,5 +1,6 @@
 """TVIPS movies: parts, what the header of each frame says, and parts that are missing."""
 
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -45,9 +46,10 @@ def test_parts_are_one_movie(per_file: int, tmp_path: Path) -> None:
 
 def test_a_folder_is_its_first_part(tmp_path: Path) -> None:
     first = write_tvips(tmp_path / "a.tvips", FRAMES, per_file=3)
-    source = open_source(tmp_path)
-    assert len(source.files) == 3
-    np.testing.assert_array_equal(source.read(0, 7), FRAMES)
+    for place in (tmp_path, f"{tmp_path}/a_*.tvips"):
+        source = open_source(place)
+        assert len(source.files) == 3
+        np.testing.assert_array_equal(source.read(0, 7), FRAMES)
     with pytest.raises(SourceError, match=r"later part of a movie.*Open .*a_000\.tvips"):
         open_source(first.with_name("a_001.tvips"))
 
@@ -135,3 +137,10 @@ def test_damage(tmp_path: Path) -> None:
     middle.write_bytes(middle.read_bytes()[:-10])
     with pytest.raises(SourceError, match=r"b_001\.tvips: the file ends in frame 2 of this part"):
         open_source(first)
+
+
+def test_a_damaged_size_that_makes_billions_of_frames(tmp_path: Path) -> None:
+    path = write_tvips(tmp_path / "a.tvips", FRAMES[:, :1, :1].astype("u1"), header=12)
+    os.truncate(path, 2**31)  # a sparse file
+    with pytest.raises(SourceError, match=r"number of frames is impossible.*165,\d{3},\d{3} of a few bytes"):
+        open_source(path)

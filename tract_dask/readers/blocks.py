@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import SourceError
 from .source import (
     NOTHING_KNOWN,
     Frames,
@@ -157,3 +158,25 @@ def read_records(path: Path, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -
         for k, offset in enumerate(offsets.tolist()):
             fill_from(file, offset, found[k : k + 1], path)
     return found
+
+
+MOST_RECORDS = 1 << 24
+"""More frames that each have a header of their own are a damaged header: to read theirs would take minutes."""
+
+
+def checked_records(count: int, where: str) -> None:
+    """Check how many frames with a header or time stamp each a file would have, before room is made for them.
+
+    Raises
+    ------
+    SourceError
+        Where there are too many to be true.
+    """
+    if count > MOST_RECORDS:
+        raise SourceError(
+            "the number of frames is impossible",
+            where,
+            f"at most {MOST_RECORDS:,}",
+            f"{count:,} of a few bytes each",
+            "The header is damaged: make the copy or the export again",
+        )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
-from .blocks import BlockSource, read_records
+from .blocks import BlockSource, checked_records, read_records
 from .merlin_raw import RawLayout, RawSource
 from .source import Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, truncated, untested
 from .times import timed
@@ -56,6 +56,7 @@ def open_merlin(path: Path, inner: str, settings: SourceSettings, permit: Permit
     )
     if not count:
         raise truncated(str(path), "in its first frame", stride, size)
+    checked_records(n_frames, str(path))
     starts = stride * np.arange(n_frames, dtype=np.int64)
     known = _metadata(path, first, text, starts, rest)
     source = BlockSource(

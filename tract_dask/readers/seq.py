@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import SourceError
 from ..settings.run import SourceSettings
-from .blocks import BlockSource, read_records
+from .blocks import BlockSource, checked_records, read_records
 from .source import Permit, SourceMetadata, checked_shape, truncated
 from .times import timed
 
@@ -56,6 +56,7 @@ def open_seq(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     """
     header = _header(path)
     n_frames, notes = _count(path, header)
+    checked_records(n_frames, str(path))
     offsets = header.first + header.stride * np.arange(n_frames, dtype=np.int64)
     known = _times(path, header, offsets)
     if known.frame_time_s is None and math.isfinite(header.rate) and 1e-6 < header.rate < 1e9:

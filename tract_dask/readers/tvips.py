@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
-from .blocks import BlockSource, read_records
+from .blocks import BlockSource, checked_records, read_records
 from .source import FrameValues, Permit, SourceMetadata, checked_file, checked_shape, truncated, untested
 from .times import timed
 from .units import to_pm
@@ -52,6 +52,7 @@ def open_tvips(path: Path, inner: str, settings: SourceSettings, permit: Permit 
     sizes = [checked_file(file, None if file == path else permit).st_size for file in files]
     starts = tuple(np.cumsum([0, *sizes[:-1]]).tolist())
     counts, notes = _counts(files, sizes, series)
+    checked_records(sum(counts), str(path))
     headers = _headers(files, counts, series)
     n_frames, n_y, n_x = checked_shape((len(headers), series.n_y, series.n_x), str(path))
     offsets = [start + part for start, part in zip(starts, _offsets(counts, series), strict=True)]
