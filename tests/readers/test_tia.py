@@ -136,6 +136,10 @@ def test_damage(tmp_path: Path) -> None:
         path.write_bytes(whole[:at] + number.to_bytes(width, "little") + whole[at + width :])
         with pytest.raises(SourceError):
             open_source(path)
+    table = 72
+    path.write_bytes(whole[:table] + whole[table : table + 8] * 5 + whole[table + 40 :])
+    with pytest.raises(SourceError, match="the images of the series overlap"):
+        open_source(path)
     path.write_bytes(struct.pack("<3H", 0x4949, 0x0197, 0x0230) + whole[6:])
     with pytest.raises(SourceError, match="not that of a TIA series"):
         open_source(path)

@@ -15,7 +15,7 @@ from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
 from .merlin_raw import RawLayout, RawSource
 from .source import Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, truncated, untested
-from .times import timed
+from .times import timed_ticks
 from .units import to_seconds
 
 _LINE = re.compile(
@@ -270,7 +270,7 @@ def _timed(path: Path, stamps: list[str]) -> SourceMetadata:
         times = np.array(list(map(_moment, stamps)), "datetime64[ns]").astype(np.int64)
     except ValueError as error:
         return SourceMetadata(notes=(f"{path.name}: the time stamps of its frames cannot be read: {error}",))
-    return replace(timed((times - times[0]) / 1e9, path.name), began_s=float(times[0]) / 1e9 or None)
+    return timed_ticks(times, 1_000_000_000, path.name)
 
 
 def _moment(stamp: str) -> str:

@@ -14,7 +14,7 @@ from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
 from .source import Permit, SourceMetadata, checked_shape, truncated
-from .times import timed
+from .times import timed_ticks
 
 _HEADER_BYTES = 1024
 _NUMBERS = ("width", "height", "bits", "bits_real", "image_bytes", "format", "n", "origin", "stride")
@@ -194,7 +194,7 @@ def _times(path: Path, header: _Header, offsets: NDArray[np.int64]) -> SourceMet
     if header.version < _LONG_HEADER and micro.max() >= 1000:
         micro[:] = 0  # whatever lay in memory
     since = (stamps["s"].astype(np.int64) * 1000 + stamps["ms"]) * 1000 + micro
-    return replace(timed((since - since[0]) / 1e6, path.name), began_s=float(since[0]) / 1e6 or None)
+    return timed_ticks(since, 1_000_000, path.name)
 
 
 def _references(path: Path) -> dict[str, Path]:

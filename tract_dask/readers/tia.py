@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
-from .blocks import BlockSource, read_records
+from .blocks import BlockSource, checked_records, read_records
 from .source import Frames, Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, truncated
 from .tia_header import Head, tia_head
-from .times import timed
+from .times import timed_ticks
 from .units import square_pixel, to_pm, to_seconds
 
 _TAGGED = (0x4142, 0x4152)
@@ -55,7 +55,7 @@ def open_tia(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     stored, shape = _alike(path, elements)
     dtype = checked_dtype(stored, str(path))
     n_frames, n_y, n_x = checked_shape((len(offsets), *shape), str(path))
-    _inside(path, offsets, _ELEMENT.itemsize + n_y * n_x * stored.itemsize)
+    _check_apart(path, _inside(path, offsets, _ELEMENT.itemsize + n_y * n_x * stored.itemsize), n_y * n_x)
     return TiaSource(
         path=str(path),
         files=(path,),
@@ -125,6 +125,7 @@ def _tables(path: Path, head: Head) -> tuple[NDArray[np.int64], NDArray[np.int64
             f"{head.n_valid} of {head.n_elements}",
             "Check the recording, or make the copy again",
         )
+    checked_records(head.n_valid, str(path))
     if head.table + head.n_elements * item.itemsize > size:
         raise truncated(str(path), "in its table of offsets", head.table + head.n_elements * item.itemsize, size)
     starts = np.fromfile(path, item, head.n_valid, offset=head.table)
@@ -153,6 +154,18 @@ def _inside(path: Path, offsets: NDArray[np.int64], length: int) -> NDArray[np.i
         k = int(beyond[0])
         raise truncated(str(path), f"in frame {k} of {len(offsets)}", int(offsets[k]) + length, size)
     return offsets
+
+
+def _check_apart(path: Path, offsets: NDArray[np.int64], n_pixels: int) -> None:
+    """Refuse a damaged table, by which images would share bytes."""
+    if np.any(np.diff(np.sort(offsets)) < _ELEMENT.itemsize + n_pixels):
+        raise SourceError(
+            "the images of the series overlap",
+            str(path),
+            f"{_ELEMENT.itemsize + n_pixels:,} bytes or more from one to the next",
+            f"{int(np.diff(np.sort(offsets)).min()):,}",
+            "The table of offsets is damaged: make the copy or the export again",
+        )
 
 
 def _alike(path: Path, elements: NDArray[Any]) -> tuple[np.dtype[Any], tuple[int, int]]:
@@ -195,8 +208,7 @@ def _metadata(
         notes += (f"{path.name}: the pixel size changes at frame {changed[0]}; that of frame 0 is used for all",)
     if head.n_valid < head.n_elements:
         notes += (f"{path.name}: {head.n_valid} of {head.n_elements} images were written; the others are left out",)
-    stamps = read_records(path, tags, _TAG)["seconds"]
-    known = timed(stamps, path.name)
+    known = timed_ticks(read_records(path, tags, _TAG)["seconds"].astype(np.int64), 1, path.name)
     if known.frame_time_s is not None and known.frame_time_s < _EXACT_S:
         notes += (f"{path.name}: its time stamps are whole seconds; the times of frames are no better than that",)
     return replace(
@@ -204,7 +216,6 @@ def _metadata(
         pixel_size_pm=pixel,
         frame_time_s=known.frame_time_s or _step_of(head) or _frame_time(path, permit),
         notes=notes + known.notes,
-        began_s=float(stamps[0]) if len(stamps) else None,
     )
 
 

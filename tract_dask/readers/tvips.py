@@ -14,7 +14,7 @@ from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
 from .source import FrameValues, Permit, SourceMetadata, checked_file, checked_shape, truncated, untested
-from .times import timed
+from .times import timed_ticks
 from .units import to_pm
 
 _SERIES_BYTES = 256
@@ -216,7 +216,7 @@ def _headers(files: tuple[Path, ...], counts: list[int], series: _Series) -> NDA
 
 def _metadata(path: Path, series: _Series, headers: NDArray[Any]) -> SourceMetadata:
     stamps = headers["seconds"].astype(np.int64) * 1000 + headers["milliseconds"]
-    known = timed((stamps - stamps[0]) / 1000, path.name)
+    known = timed_ticks(stamps, 1000, path.name)
     names = headers.dtype.names or ()
     along = {name: FrameValues(headers[name].astype(np.float64), _ALONG[name]) for name in _ALONG if name in names}
     told = {name: found for name, found in along.items() if np.any(found.values)}
@@ -230,7 +230,6 @@ def _metadata(path: Path, series: _Series, headers: NDArray[Any]) -> SourceMetad
         pixel_size_pm=pixel,
         notes=notes + known.notes,
         along_frames={**known.along_frames, **told},
-        began_s=float(stamps[0]) / 1000 or None,
     )
 
 
