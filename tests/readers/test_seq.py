@@ -34,7 +34,7 @@ def test_times_to_the_microsecond_and_a_gap(tmp_path: Path) -> None:
     start = 1_700_000_000_000_000
     steps = np.array([0, 33_001, 66_002, 99_003, 333_003, 366_004])
     known = open_source(write_seq(tmp_path / "a.seq", FRAMES, stamps_us=(start + steps).tolist())).metadata
-    assert known.frame_time_s == 0.033001
+    assert (known.frame_time_s, known.start_s) == (0.033001, 1_700_000_000)
     assert known.along_frames["time"].values.tolist() == (steps / 1e6).tolist()
     assert "gap of 0.234 s after frame 3" in known.notes[0]
 

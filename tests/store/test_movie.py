@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from hypothesis import strategies as st
 from tract_dask.errors import DestinationError, SourceError, StoreError
 from tract_dask.progress import ShardDone, StageDone, StageStarted, Warned
 from tract_dask.readers import open_source
+from tract_dask.readers.source import FrameValues
+from tract_dask.readers.times import timed
 from tract_dask.run.verify import verify
 from tract_dask.settings import ConvertSettings, MetadataSettings
 from tract_dask.stages.convert.stage import convert
@@ -554,3 +557,44 @@ def test_a_layout_is_a_value():
     layout = plan_layout((600, 4096, 4096), "u2")
     assert layout == Layout((600, 4096, 4096), np.dtype("u2"), 7, (7, 256, 256), (4, 16, 64))
     assert hash(layout) == hash(pickle.loads(pickle.dumps(layout)))
+
+
+STAMPS = 1.7e9 + np.array([0.0, 0.5, 1.0, 2.5, 3.0])
+"""Unix times of five frames, of which two were lost after the third."""
+
+
+def stamped(path):
+    source = open_source(save(path, pixels((5, 40, 40), "uint16")))
+    temperature = FrameValues(np.linspace(20, 24, 5), "degC")
+    known = timed(STAMPS, path.name)
+    known = replace(known, along_frames=known.along_frames | {"temperature": temperature})
+    return replace(source, metadata=known)
+
+
+def test_time_stamps_and_headers_of_frames_are_kept(tmp_path):
+    events = []
+    movie = open_movie(convert(stamped(tmp_path / "a.npy"), tmp_path / "movie.zarr", on_event=events.append))
+    assert movie.frame_time_s == 0.5
+    np.testing.assert_array_equal(movie.times(), [0, 0.5, 1, 2.5, 3])
+    np.testing.assert_array_equal(movie.frames["t"], [0, 0.5, 1, 2.5, 3])
+    assert "gap of 1.5 s after frame 2" in next(event for event in events if isinstance(event, Warned)).message
+    values = movie.frame_values()
+    assert list(values) == ["temperature"]
+    np.testing.assert_array_equal(values["temperature"], np.linspace(20, 24, 5))
+    assert values["temperature"].attrs["units"] == "degC"
+    assert xr.open_zarr(tmp_path / "movie.zarr")["frame_temperature"].dims == ("t",)
+    assert verify(tmp_path / "movie.zarr").sound
+
+
+def test_a_frame_time_of_the_user_counts_more_than_time_stamps(tmp_path):
+    path, source = tmp_path / "movie.zarr", stamped(tmp_path / "a.npy")
+    for said, times in ((0.25, [0, 0.25, 0.5, 0.75, 1]), (None, [0, 0.5, 1, 2.5, 3]), (0.5, [0, 0.5, 1, 2.5, 3])):
+        movie = open_movie(convert(source, path, metadata=MetadataSettings(frame_time_s=said)))
+        np.testing.assert_array_equal(movie.times(), times)
+
+
+@pytest.mark.parametrize("stamps", [np.zeros(5), [0, 1, 1, 2, 3], [0, 1, np.nan, 2, 3], [4, 3, 2, 1, 0]])
+def test_time_stamps_that_do_not_grow_are_not_used(stamps):
+    known = timed(stamps, "a.seq")
+    assert (known.frame_time_s, dict(known.along_frames)) == (None, {})
+    assert len(known.notes) == (1 if np.any(stamps) else 0)

@@ -123,6 +123,19 @@ class SummedFrames(Movie):
         """Frames that are best read together: the sums that a layer of the source's tiles holds."""
         return max(1, self.source.layer_frames // self.n)
 
+    def times(self) -> NDArray[np.float64]:
+        """Return the start of each sum (frames,) in s; its number where the frame time is not known."""
+        if self.frame_time_s is None:
+            return np.arange(self.n_frames, dtype=np.float64)
+        return self.source.times()[: self.n * self.n_frames : self.n]
+
+    def frame_values(self) -> dict[str, xr.Variable]:
+        """Return what the headers of the frames say, by name: means over the frames of each sum."""
+        return {
+            name: xr.Variable("frame", of.values[: self.shift.shape[0]].reshape(-1, self.n).mean(axis=1), of.attrs)
+            for name, of in self.source.frame_values().items()
+        }
+
     def read(self, start: int, stop: int, y: slice = _EVERYTHING, x: slice = _EVERYTHING) -> Frames:
         """Return the sums ``start`` to ``stop`` (not included), or a part of their field; (frames, y, x)."""
         y, x = (slice(*span.indices(length)[:2]) for span, length in zip((y, x), self.shape[1:], strict=True))

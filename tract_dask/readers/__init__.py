@@ -25,6 +25,7 @@ from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
 from .registry import Reader, by_suffix
+from .selection import select
 from .seq import belongs_to_seq, open_seq
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
@@ -105,9 +106,9 @@ def open_source(
         What to open. In a folder, all files of its one readable format; of several files, the frames in their order.
         A path that is there is never taken for a pattern. A :class:`FileList` is opened as it is.
     settings
-        Shape and type of raw files.
+        Shape and type of raw files; which frames, field and bins of any movie are read.
     metadata
-        What the user knows better than the file.
+        What the user knows better than the file: size and time of its pixels and frames, whatever part is read.
     permit
         Called with the resolved path of every file before it is opened, also of those that links inside of HDF5 files
         lead to; raises to refuse it. It is asked again where the files of a sequence are opened to be read.
@@ -137,7 +138,7 @@ def open_source(
         gain=metadata.gain,
     )
     listed = tuple(place) if isinstance(place, list) else ()
-    return replace(source, path=name, metadata=merged, listed=listed, permit=permit)
+    return select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
 
 
 def open_cached(

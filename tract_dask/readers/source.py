@@ -63,13 +63,13 @@ class SourceMetadata:
         Electron counts for one detector unit.
     notes
         Sentences that the user should read, such as one on a gap in a sequence.
+    start_s
+        When the first frame began, in seconds since 1970; for files that are parts of one movie.
     along_frames
         What each frame says of itself, by name: ``time`` (s, from the first frame on), ``temperature`` and others.
     references
         Files of the detector that lie beside the movie, by what they are: ``dark``, ``gain``, ``defects``,
         ``metadata``.
-    began_s
-        Moment of the first frame, in seconds since 1970.
     """
 
     pixel_size_pm: float | None = None
@@ -77,9 +77,9 @@ class SourceMetadata:
     dose: float | None = None
     gain: float = 1.0
     notes: tuple[str, ...] = ()
+    start_s: float | None = None
     along_frames: Mapping[str, FrameValues] = field(default_factory=dict)
     references: Mapping[str, Path] = field(default_factory=dict)
-    began_s: float | None = None
 
 
 NOTHING_KNOWN = SourceMetadata()
@@ -418,7 +418,7 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
 
 
 def untested(name: str, where: str) -> str:
-    """Return the note for a format of which we had no file from a camera."""
+    """Return the note for a format that was never tested with a camera's file."""
     return (
         f"{where}: this reader of {name} was not tested with a file from a camera; compare a frame with the vendor's"
         " program"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,7 +25,7 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     -------
     SourceMetadata
         With ``time`` along the frames and ``frame_time_s``; a note where frames were lost. Of stamps that are not
-        finite, or do not grow, there is only a note.
+        finite, or do not grow, there is only a note. ``start_s`` is the first stamp, also where it is the only one.
 
     Examples
     --------
@@ -37,32 +35,34 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     ('a.seq: the time stamps have a gap of 1 s after frame 1, where a frame takes 0.5 s; the times of frames show it',)
     """
     stamps = np.asarray(stamps_s, np.float64)
-    return _course(stamps, where) if np.any(stamps) else SourceMetadata()  # a header that was left empty
+    if not np.any(stamps):
+        return SourceMetadata()  # a header that was left empty
+    return _course(stamps, float(stamps[0]), where)
 
 
 def timed_ticks(ticks: NDArray[np.int64], per_second: int, where: str) -> SourceMetadata:
-    """Return what :func:`timed` does, and when the movie began, by stamps in whole parts of a second since 1970.
+    """Return what :func:`timed` does, by stamps in whole parts of a second since 1970.
 
     Their differences are exact, where seconds in float64 would be good to a quarter of a microsecond.
     """
     if not ticks.any():
         return SourceMetadata()
-    known = _course((ticks - ticks[0]) / per_second, where)
-    return replace(known, began_s=float(ticks[0]) / per_second)
+    return _course((ticks - ticks[0]) / per_second, float(ticks[0]) / per_second, where)
 
 
-def _course(stamps: NDArray[np.float64], where: str) -> SourceMetadata:
+def _course(stamps: NDArray[np.float64], start_s: float, where: str) -> SourceMetadata:
     if len(stamps) < 2:
-        return SourceMetadata()
+        return SourceMetadata(start_s=start_s if np.isfinite(stamps).all() else None)
     steps = np.diff(stamps)
     if not np.isfinite(stamps).all() or not (steps > 0).all():
-        return SourceMetadata(notes=_unfit(stamps, steps, where))
+        return SourceMetadata(notes=_unfit(steps, where))
     usual = float(f"{np.median(steps):.9g}")
     along = {"time": FrameValues(np.round(stamps - stamps[0], 9), "s")}
-    return SourceMetadata(frame_time_s=usual, notes=_gaps(steps, usual, where), along_frames=along)
+    notes = _gaps(steps, usual, where)
+    return SourceMetadata(frame_time_s=usual, notes=notes, start_s=start_s, along_frames=along)
 
 
-def _unfit(stamps: NDArray[np.float64], steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
+def _unfit(steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
     bad = int(np.argmax(~(steps > 0))) + 1
     return (f"{where}: the time stamps of its frames do not grow (first at frame {bad}); they are not used",)
 

@@ -16,7 +16,7 @@ from .declare import Settings, setting
 
 @dataclass(frozen=True)
 class SourceSettings(Settings):
-    """How to read a raw file, which does not describe itself."""
+    """What is read of a movie, and how to read a raw file, which does not describe itself."""
 
     raw_shape: tuple[int, ...] | None = setting(
         None,
@@ -25,6 +25,11 @@ class SourceSettings(Settings):
     )
     raw_dtype: str | None = setting(None, "Pixel type of a raw binary file, such as uint16 or >f4")
     raw_offset: int = setting(0, "Bytes to skip at the start of a raw binary file", unit="bytes", low=0)
+    frames: str | None = setting(
+        None, "Read these frames only: start:stop or start:stop:step, such as 100:2000:2", common=True
+    )
+    roi: str | None = setting(None, "Read this field only: y0:y1,x0:x1, such as 0:512,256:768", unit="px", common=True)
+    bin: int = setting(1, "Sum the pixels of squares with this side", unit="px", low=1, high=64, common=True)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ..kernels.blur import Tiles
 from . import datasets, metadata, schema
 from .damage import reading
 from .journal import entries, journal_beside
-from .ome import AXES, CHANGING
+from .ome import AXES, CHANGING, frame_array
 from .shard_files import Grid, ShardReader, chunk_path, overlaps
 from .shards import Shard, Shards, split
 
@@ -205,6 +205,19 @@ class Movie:
     def statistics(self) -> xr.Dataset:
         """Return the per-frame statistics (``schema.STATISTICS``) on ``t``, in memory."""
         return datasets.open_dataset(self.path, only=tuple(schema.STATISTICS))
+
+    def times(self) -> NDArray[np.float64]:
+        """Return the start of each frame (frames,) in s; the frame's number where the frame time is not known."""
+        return np.asarray(datasets.open_dataset(self.path, only=("t",))["t"].to_numpy(), np.float64)
+
+    def frame_values(self) -> dict[str, xr.Variable]:
+        """Return what the headers of the frames say beside their times, by name: variables on ``frame`` with units."""
+        names = [name for name in metadata.attributes(self.path).get("frame_values", ()) if name != "time"]
+        if not names:
+            return {}
+        stored = datasets.open_dataset(self.path, only=tuple(map(frame_array, names)))
+        found = {name: stored[frame_array(name)].variable for name in names}
+        return {name: xr.Variable("frame", of.to_numpy(), of.attrs) for name, of in found.items()}
 
     @property
     def frames(self) -> xr.DataArray:

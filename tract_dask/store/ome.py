@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
+from numpy.typing import NDArray
 
 from . import datasets, metadata, schema
 from .damage import METADATA, read_json
@@ -27,27 +30,48 @@ def write_metadata(path: Path, ours: dict[str, Any]) -> None:
     """
     metadata.check_nodes(path, ours, AXES)
     frame_time, pixel = ours["frame_time_s"], ours["pixel_size_pm"]
-    for axis, length, step, units in (
-        ("t", ours["shape"][0], frame_time, ("s", "frame")),
-        ("y", ours["shape"][1], pixel, ("pm", "px")),
-        ("x", ours["shape"][2], pixel, ("pm", "px")),
+    for axis, values, step, units in (
+        ("t", _times(path, ours), frame_time, ("s", "frame")),
+        ("y", np.arange(ours["shape"][1]) * (pixel or 1.0), pixel, ("pm", "px")),
+        ("x", np.arange(ours["shape"][2]) * (pixel or 1.0), pixel, ("pm", "px")),
     ):
-        datasets.overwrite_array(path / axis, np.arange(length) * (step or 1.0))
+        datasets.overwrite_array(path / axis, values)
         zarr.open_array(path / axis, mode="r+").attrs["units"] = units[0] if step else units[1]
     root = read_json(path / METADATA)
     root["attributes"] = {
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),
         metadata.ATTRIBUTE: ours,
     }
-    root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": _nodes(path)}
+    nodes = _nodes(path, ours.get("frame_values", ()))
+    root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": nodes}
     metadata.write_root(path, root, changed=AXES)
 
 
-def _nodes(path: Path) -> dict[str, Any]:
+def frame_array(name: str) -> str:
+    """Return the name of the array that holds what the headers of the frames say, such as ``frame_temperature``."""
+    return f"frame_{name}"
+
+
+def _times(path: Path, ours: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the start of each frame in s, or its number where no frame time is known.
+
+    Those of the time stamps, unless the user gave a frame time that is not their median step.
+    """
+    n_frames, step = ours["shape"][0], ours["frame_time_s"]
+    if step and n_frames > 1 and "time" in ours.get("frame_values", ()):
+        opened: Any = datasets.open_array if ours["complete"] else zarr.open_array  # to which missing chunks are NaN
+        stamps = np.asarray(opened(path / frame_array("time"))[:], np.float64)
+        if math.isclose(np.median(np.diff(stamps)), step, rel_tol=1e-6):
+            return stamps
+    return np.arange(n_frames) * (step or 1.0)
+
+
+def _nodes(path: Path, more: Iterable[str]) -> dict[str, Any]:
     """Return the metadata of all arrays and groups of the store, so that xarray opens it by reading one file."""
     names = (
         *AXES,
         *schema.STATISTICS,
+        *map(frame_array, more),
         "0",
         "binned",
         *(f"binned/{file.name}" for file in (path / "binned").glob("[0-9]*")),

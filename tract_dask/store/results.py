@@ -8,7 +8,7 @@ journal's folder until all is done (:mod:`tract_dask.store.parts`); then it is j
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,7 @@ def create(
     drift: np.ndarray[Any, Any],
     time: np.ndarray[Any, Any],
     frames_per_shard: int,
+    frame_values: Mapping[str, xr.Variable] | None = None,
     **about: Any,
 ) -> None:
     """Create the store at ``path``, whole or not at all.
@@ -76,12 +77,14 @@ def create(
         Measured drift (frame, axis) in px and start of each frame (frame) in s.
     frames_per_shard
         Frames in an inner chunk of every variable: those of a movie shard.
+    frame_values
+        Coordinates on ``frame``, such as the temperature.
     about
         Attributes under :data:`.metadata.ATTRIBUTE`.
     """
     sizes = {"frame": len(time), "column_id": columns.sizes["column_id"]} | schema.SIZES
     known = {"drift_measured": drift, "time": time}
-    static = columns.assign_coords(schema.coordinates(len(time)))
+    static = columns.assign_coords(schema.coordinates(len(time)) | dict(frame_values or {}))
     static = static.assign({name: (schema.RESULTS[name].dims, values) for name, values in known.items()})
     static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
     for name in (*known, *schema.COLUMNS):

@@ -173,6 +173,18 @@ STATISTICS = _declare(
 """Per-frame statistics in movie.zarr."""
 
 
+FRAME_VALUES = _declare(
+    Variable("time", ("t",), "float64", "s", "Time stamp of the frame, from the first one on", _NAN),
+    Variable("temperature", ("t",), "float64", "degC", "Temperature of the holder, measured", _NAN),
+    Variable("temperature_set", ("t",), "float64", "degC", "Temperature of the holder, as it was set", _NAN),
+    Variable("stage_tilt", ("t",), "float64", "deg", "Tilt of the stage about its axis", _NAN),
+    Variable("stage_tilt_beta", ("t",), "float64", "deg", "Tilt of the stage about its second axis", _NAN),
+    Variable("bias", ("t",), "float64", "V", "Voltage at the specimen", _NAN),
+    Variable("current", ("t",), "float64", "A", "Current through the specimen", _NAN),
+)
+"""What the headers of frames may say: ``frame_`` and the name in movie.zarr, coordinates on ``frame`` in the tracks."""
+
+
 def texts(values: Iterable[str]) -> np.ndarray[Any, Any]:
     """Return strings as an array of objects: the only form of text that Zarr v3 stores by its specification."""
     return np.array([str(value) for value in values], dtype=object)

@@ -14,7 +14,7 @@ from ...settings.run import MetadataSettings
 from ...store import datasets, disk, files, schema
 from ...store.layout import LEVEL_DTYPE, Layout
 from ...store.metadata import attributes, update_attributes
-from ...store.ome import AXES, CHANGING, write_metadata
+from ...store.ome import AXES, CHANGING, frame_array, write_metadata
 from ...store.shard_files import CHUNK_KEYS, Grid, codecs
 
 
@@ -50,6 +50,10 @@ def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known:
         _create_vector(aside / axis, length, axis, "float64")
     for variable in schema.STATISTICS.values():
         _create_vector(aside / variable.name, layout.shape[0], "t", variable.dtype, variable.attributes)
+    for name, of in known.along_frames.items():
+        said = schema.FRAME_VALUES[name].attributes if name in schema.FRAME_VALUES else {"units": of.units}
+        _create_vector(aside / frame_array(name), layout.shape[0], "t", "float64", said)
+        datasets.overwrite_array(aside / frame_array(name), of.values)
     plan = {
         "kind": "movie",
         "complete": False,
@@ -58,6 +62,7 @@ def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known:
         "frames_per_shard": layout.frames_per_shard,
         "chunk": layout.chunk,
         "bins": layout.bins,
+        "frame_values": list(known.along_frames),
     }
     write_metadata(aside, about | plan | quantities(known))
     disk.place_folder(aside, path)

@@ -22,16 +22,17 @@ from ...cluster.tasks import stream_shards
 from ...errors import ChangedSourceError, DestinationError, SourceError, StoreError
 from ...progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from ...readers import files_named_now, open_source
+from ...readers.selection import frame_step
 from ...readers.source import FrameSource, SourceMetadata, check_permitted
 from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, SourceSettings
 from ...settings.toml import from_toml, to_toml
-from ...store import disk, schema
+from ...store import datasets, disk, schema
 from ...store.files import check_free_space, disk_errors, remove
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.layout import Layout, disk_bytes, plan_layout
 from ...store.metadata import FORMAT, attributes, check_destination, check_nodes, format_of, is_of_system, is_sound
 from ...store.movie import Movie, open_movie
-from ...store.ome import AXES
+from ...store.ome import AXES, frame_array
 from ...store.provenance import WHOLE_BYTES, provenance
 from ...store.shards import Shard, split
 from ...store.stamps import Stamps, changed
@@ -98,7 +99,7 @@ def convert(
     """
     started = time.perf_counter()
     movie = open_source(source, source_settings, metadata) if isinstance(source, str | Path) else source
-    known = _overridden(movie.metadata, metadata)
+    known = _overridden(movie.metadata, metadata, source_settings)
     path = Path(destination).absolute()
     for note in known.notes:
         on_event(Warned(note))
@@ -217,6 +218,8 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
                 statistics[name][shard.start : shard.stop] = values
             on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
+        for name in about.get("frame_values", ()):
+            datasets.overwrite_array(path / frame_array(name), source.metadata.along_frames[name].values)
         finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
 
@@ -337,11 +340,17 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-def _overridden(found: SourceMetadata, metadata: MetadataSettings) -> SourceMetadata:
-    """Return what is known of the movie, with what the user says above what the source says."""
+def _overridden(found: SourceMetadata, metadata: MetadataSettings, declared: SourceSettings) -> SourceMetadata:
+    """Return what is known of the movie, with what the user says above what the source says.
+
+    The user speaks of the pixels and frames of the source, whatever part of it is read.
+    """
     said = {name: value for name, value in quantities(metadata).items() if value is not None}
     if said["gain"] == AS_THE_FILE_SAYS.gain:
         del said["gain"]
+    for name, factor in (("pixel_size_pm", declared.bin), ("frame_time_s", frame_step(declared))):
+        if name in said:
+            said[name] *= factor
     return replace(found, **said)
 
 

@@ -56,8 +56,9 @@ class Job:
             path,
             self.columns,
             self.drift,
-            frame_times(movie),
+            movie.times(),
             movie.shards[0].frames,
+            movie.frame_values(),
             **provenance(key, self.settings, str(movie.path)),
             **calibration(movie),
             window=self.window_px,
@@ -171,11 +172,6 @@ def check_counts(smallest: Floats) -> None:
             f"{smallest[frame]:g} in frame {frame}",
             "Choose the estimator lsq, or convert frames from which nothing was subtracted",
         )
-
-
-def frame_times(movie: Movie) -> Floats:
-    """Return the start of each frame in s; the frame's number where the frame time is not known."""
-    return np.arange(movie.n_frames, dtype=np.float64) * (movie.frame_time_s or 1.0)
 
 
 def calibration(movie: Movie) -> dict[str, float | None]:

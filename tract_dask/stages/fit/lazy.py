@@ -7,7 +7,7 @@ import xarray as xr
 from ...settings.run import FitSettings
 from ...store import results, schema
 from ...store.movie import Movie
-from .job import calibration, frame_times, prepare
+from .job import calibration, prepare
 from .measure import Values, measure
 
 
@@ -59,12 +59,12 @@ def fit_columns(
         return {name: values[name].astype(of.dtype) for name, of in fitted.items()}
 
     shards = [delayed(fit_shard, pure=False)(index) for index in range(len(movie.shards))]
-    dataset = columns.assign_coords(schema.coordinates(movie.n_frames))
+    dataset = columns.assign_coords(schema.coordinates(movie.n_frames) | movie.frame_values())
     for name, of in fitted.items():
         shapes = [(shard.frames, *(sizes[dim] for dim in of.dims[1:])) for shard in movie.shards]
         blocks = [da.from_delayed(fits[name], shape, of.dtype) for fits, shape in zip(shards, shapes, strict=True)]
         dataset[name] = (of.dims, da.concatenate(blocks), of.attributes)
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
-    dataset["time"] = ("frame", frame_times(movie), schema.RESULTS["time"].attributes)
+    dataset["time"] = ("frame", movie.times(), schema.RESULTS["time"].attributes)
     dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window_px, job.reference_blur_px)
     return dataset

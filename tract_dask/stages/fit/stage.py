@@ -23,7 +23,7 @@ from ...store.provenance import processor, stage_key, widths
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done
-from .job import Job, calibration, frame_times, prepare
+from .job import Job, calibration, prepare
 from .join import join
 from .measure import measure
 
@@ -61,7 +61,7 @@ def fit_movie(
     about = metadata.attributes(path)
     if about.get("key") == key and about.get("complete"):
         remove_journal(journal_beside(path))  # of a run that was killed just before it had removed it
-        results.calibrate(path, frame_times(movie), **calibration(movie))
+        results.calibrate(path, movie.times(), **calibration(movie))
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
     if not _goes_on(path, key, on_event):
