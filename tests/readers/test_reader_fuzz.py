@@ -13,6 +13,7 @@ import mrcfile
 import numpy as np
 import pytest
 import tifffile
+from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
 from tract_dask.errors import TractError
@@ -131,6 +132,15 @@ BASES: dict[str, Callable[[Path], object]] = {
     "h264.mp4": lambda path: write_video(path, FRAMES.astype("u1"), "libx264", "yuv420p"),
     "png.mov": lambda path: write_video(path, FRAMES.astype("u1"), "png"),
     "movie.raw": lambda path: path.write_bytes(FRAMES.tobytes()),
+    "small.ser": lambda path: write_ser(path, FRAMES, planned=7),
+    "large.ser": lambda path: write_ser(path, FRAMES, version=0x0220, axes=[(5, 0.5, "Time", "s")]),
+    "first.tvips": lambda path: write_tvips(path, FRAMES, version=1),
+    "second.tvips": lambda path: write_tvips(path, FRAMES),
+    "three.seq": lambda path: write_seq(path, FRAMES.astype("u1"), version=3),
+    "six.seq": lambda path: write_seq(path, FRAMES, version=6),
+    "processed.mib": lambda path: write_mib(path, FRAMES),
+    "quad.mib": lambda path: write_mib(path, FRAMES[:, :40, :32], raw=12, layout="2x2"),
+    "bits.mib": lambda path: write_mib(path, np.repeat(FRAMES[:, :, :32], 2, 2) & 1, raw=1),
 }
 HOSTILE = (0, 1, 2, 3, 7, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1)
 DIGITS = (b"0", b"-1", b"65536", b"4294967296", b"99999999999999999999", b"1e400", b"nan", b"9" * 5000)

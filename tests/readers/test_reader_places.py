@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
 from tract_dask.errors import InputError, SourceError
@@ -22,7 +23,10 @@ from tract_dask.settings import SourceSettings
 
 FRAMES = np.random.default_rng(0).integers(0, 200, (4, 20, 24)).astype("u2")
 DECLARED = SourceSettings(raw_shape=(0, 20, 24), raw_dtype="uint16")
-KINDS = pytest.mark.parametrize("suffix", sorted(READERS))
+BESIDE = {".emi", ".hdr"}
+"""Suffixes of files whose frames lie in another one."""
+
+KINDS = pytest.mark.parametrize("suffix", sorted(set(READERS) - BESIDE))
 
 
 def fails(path: Path | str, *words: str) -> None:
@@ -48,6 +52,8 @@ def write(path: Path) -> Path:
         header = np.zeros(256, "<i4")
         header[:4] = *FRAMES.shape[::-1], 6
         path.write_bytes(header.tobytes() + FRAMES.tobytes())
+    elif suffix in (".ser", ".tvips", ".seq", ".mib"):
+        {".ser": write_ser, ".tvips": write_tvips, ".seq": write_seq, ".mib": write_mib}[suffix](path, FRAMES)
     else:
         path.write_bytes(FRAMES.tobytes())
     return path

@@ -21,14 +21,18 @@ from ..settings.run import MetadataSettings, SourceSettings
 from . import video
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
+from .merlin import is_header_of_mib, open_merlin
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
 from .registry import Reader, by_suffix
 from .selection import select
+from .seq import belongs_to_seq, open_seq
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
+from .tia import is_emi, open_tia
 from .tiff import open_tiff
+from .tvips import is_later_part, open_tvips
 
 __all__ = [
     "READERS",
@@ -47,10 +51,14 @@ __all__ = [
 
 BUILT_IN = (
     Reader("TIFF", (".tif", ".tiff"), open_tiff),
-    Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc),
+    Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc, is_part=belongs_to_seq),
     Reader("NumPy", (".npy",), open_npy),
     Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
     Reader("video", video.SUFFIXES, video.open_video),
+    Reader("TIA", (".ser", ".emi"), open_tia, is_part=is_emi),
+    Reader("TVIPS", (".tvips",), open_tvips, is_part=is_later_part),
+    Reader("StreamPix", (".seq",), open_seq),
+    Reader("Merlin", (".mib", ".hdr"), open_merlin, is_part=is_header_of_mib),
     Reader("raw", (".raw", ".bin", ".dat"), open_raw),
 )
 """The formats that are read here."""
@@ -82,7 +90,7 @@ _NOT_APPLIED = "{} next to the movie is the {} reference of its detector, by its
 
 _RAW = READERS[".raw"]
 
-_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
+_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".emd": "EMD"}
 
 
 def open_source(

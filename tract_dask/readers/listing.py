@@ -59,7 +59,7 @@ def list_files(name: str, outer: Path, readers: Mapping[str, Reader]) -> FileLis
     if outer.is_dir():
         found = _readable(outer, readers)
     elif is_pattern(outer):
-        found = _matching(outer)
+        found = _whole(_matching(outer), readers)
     else:
         _check_folder(outer)
         return None
@@ -93,7 +93,7 @@ def _matching(pattern: Path) -> list[Path]:
 def _readable(folder: Path, readers: Mapping[str, Reader]) -> list[Path]:
     """Return the files of the one readable format in a folder, without those that only belong to another one."""
     there = [file for file in folder.iterdir() if file.suffix.lower() in readers and not file.name.startswith(".")]
-    files = [file for file in there if not readers[file.suffix.lower()].is_part(file)]
+    files = [file for file in there if not _is_part(file, readers)]
     kinds = Counter(file.suffix.lower() for file in files)
     if len({readers[kind] for kind in kinds}) > 1:
         raise SourceError(
@@ -104,3 +104,13 @@ def _readable(folder: Path, readers: Mapping[str, Reader]) -> list[Path]:
             f"Choose by a pattern, for example {folder}/*{next(iter(kinds))}",
         )
     return files
+
+
+def _whole(files: list[Path], readers: Mapping[str, Reader]) -> list[Path]:
+    """Return files without those that only belong to another one; all where each does."""
+    return [file for file in files if not _is_part(file, readers)] or files
+
+
+def _is_part(file: Path, readers: Mapping[str, Reader]) -> bool:
+    reader = readers.get(file.suffix.lower())
+    return reader is not None and reader.is_part(file)

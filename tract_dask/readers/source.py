@@ -91,7 +91,8 @@ class SourceMetadata:
     part
         Which part of the movie is read; None: all of it.
     references
-        Files of the detector that lie beside the movie, by what they are: ``dark``, ``gain``, ``defects``.
+        Files of the detector that lie beside the movie, by what they are: ``dark``, ``gain``, ``defects``,
+        ``metadata``.
     """
 
     pixel_size_pm: float | None = None
@@ -438,6 +439,14 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
     if error.errno is not None:
         remedy = "Check that it is there, its permissions, and its disk"
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
+
+
+def untested(name: str, where: str) -> str:
+    """Return the note for a format that was never tested with a camera's file."""
+    return (
+        f"{where}: this reader of {name} was not tested with a file from a camera; compare a frame with the vendor's"
+        " program"
+    )
 
 
 def truncated(where: str, place: str, expected: int, got: int) -> SourceError:

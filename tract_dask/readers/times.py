@@ -35,20 +35,34 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     ('a.seq: the time stamps have a gap of 1 s after frame 1, where a frame takes 0.5 s; the times of frames show it',)
     """
     stamps = np.asarray(stamps_s, np.float64)
+    if not np.any(stamps):
+        return SourceMetadata()  # a header that was left empty
+    return _course(stamps, float(stamps[0]), where)
+
+
+def timed_ticks(ticks: NDArray[np.int64], per_second: int, where: str) -> SourceMetadata:
+    """Return what :func:`timed` does, by stamps in whole parts of a second since 1970.
+
+    Their differences are exact, where seconds in float64 would be good to a quarter of a microsecond.
+    """
+    if not ticks.any():
+        return SourceMetadata()
+    return _course((ticks - ticks[0]) / per_second, float(ticks[0]) / per_second, where)
+
+
+def _course(stamps: NDArray[np.float64], start_s: float, where: str) -> SourceMetadata:
     if len(stamps) < 2:
-        return SourceMetadata(start_s=float(stamps[0]) if np.isfinite(stamps).all() and stamps.any() else None)
+        return SourceMetadata(start_s=start_s if np.isfinite(stamps).all() else None)
     steps = np.diff(stamps)
     if not np.isfinite(stamps).all() or not (steps > 0).all():
-        return SourceMetadata(notes=_unfit(stamps, steps, where))
+        return SourceMetadata(notes=_unfit(steps, where))
     usual = float(f"{np.median(steps):.9g}")
     along = {"time": FrameValues(np.round(stamps - stamps[0], 9), "s")}
     notes = _gaps(steps, usual, where)
-    return SourceMetadata(frame_time_s=usual, notes=notes, start_s=float(stamps[0]), along_frames=along)
+    return SourceMetadata(frame_time_s=usual, notes=notes, start_s=start_s, along_frames=along)
 
 
-def _unfit(stamps: NDArray[np.float64], steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
-    if not np.any(stamps):
-        return ()  # a header that was left empty
+def _unfit(steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
     bad = int(np.argmax(~(steps > 0))) + 1
     return (f"{where}: the time stamps of its frames do not grow (first at frame {bad}); they are not used",)
 
