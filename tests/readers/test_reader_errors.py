@@ -46,9 +46,9 @@ def test_missing_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("movie.dm4", ("DigitalMicrograph files are not read yet", ".tif", "got .dm4", "Export")),
-        ("movie.emd", ("EMD files are not read yet",)),
-        ("movie.avi", ("format is unknown", ".mrc", "got .avi", "--raw-shape")),
+        ("movie.cine", ("Phantom's files are not read", ".tif", "got .cine", "multipage TIFF")),
+        ("movie.tpx3", ("Timepix3 event files are not read",)),
+        ("movie.xyz", ("format is unknown", ".mrc", "got .xyz", "Bio-Formats", "--raw-shape")),
         ("movie", ("without a suffix",)),
     ],
 )

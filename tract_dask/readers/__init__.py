@@ -25,6 +25,7 @@ from .merlin import is_header_of_mib, open_merlin
 from .mrc import open_mrc
 from .npy import open_npy
 from .raw import open_raw
+from .recipes import unknown_format
 from .registry import Reader, by_suffix
 from .selection import select
 from .seq import belongs_to_seq, open_seq
@@ -46,7 +47,6 @@ __all__ = [
     "list_files",
     "open_cached",
     "open_source",
-    "unknown_format",
 ]
 
 BUILT_IN = (
@@ -89,8 +89,6 @@ AS_THE_FILE_SAYS = MetadataSettings()
 _NOT_APPLIED = "{} next to the movie is the {} reference of its detector, by its name; it is not applied to the frames"
 
 _RAW = READERS[".raw"]
-
-_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".emd": "EMD"}
 
 
 def open_source(
@@ -243,7 +241,7 @@ def _open_file(path: Path, *, inner: str, settings: SourceSettings, permit: Perm
     declared = settings.raw_shape is not None and settings.raw_dtype is not None
     reader = READERS.get(path.suffix.lower(), _RAW if declared else None)
     if reader is None:
-        raise unknown_format(path)
+        raise unknown_format(path, READERS)
     return _opened(reader, path, inner, settings, permit)
 
 
@@ -258,17 +256,3 @@ def _opened(reader: Reader, path: Path, inner: str, settings: SourceSettings, pe
         )
     with reading(str(path)):
         return reader.open(path, inner, settings, permit)
-
-
-def unknown_format(path: Path) -> SourceError:
-    """Return the error for a file that no reader opens."""
-    suffix = path.suffix.lower()
-    return SourceError(
-        f"{_VENDORS[suffix]} files are not read yet" if suffix in _VENDORS else "the format is unknown",
-        str(path),
-        f"a name that ends in one of {', '.join(READERS)}",
-        suffix or "a name without a suffix",
-        "Export the movie as TIFF or MRC"
-        if suffix in _VENDORS
-        else "Rename or export it; for a raw binary file declare --raw-shape and --raw-dtype",
-    )

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 from ..errors import DestinationError, InputError, MissingStoreError, StoreError
-from ..readers import READERS, unknown_format
+from ..readers import READERS
 from ..readers.listing import WILD, FileList, list_files
+from ..readers.recipes import unknown_format
 from ..store import metadata
 
 T = TypeVar("T")
@@ -418,7 +419,7 @@ def overlap(one: str, other: str) -> bool:
 
 def _check_format(place: Path) -> None:
     if place.suffix.lower() not in READERS:
-        raise unknown_format(place)
+        raise unknown_format(place, READERS)
 
 
 def _check_text(relative: str) -> None:
