@@ -103,6 +103,22 @@ def field(page, label):
     return page.get_by_label(label, exact=True)
 
 
+def test_a_folder_of_frames_is_opened_as_one_movie_by_a_click(chromium, tmp_path):
+    frames = Scene(n_frames=5).counts()
+    (tmp_path / "frames").mkdir()
+    for number, frame in enumerate(frames):
+        np.save(tmp_path / "frames" / f"f_{number}.npy", frame)
+    np.save(tmp_path / "alone.npy", frames)
+    with listening(tmp_path) as (address, _), visit(chromium, address) as page:
+        page.goto("/new")
+        expect(page.get_by_role("button", name="alone.npy")).to_be_visible()
+        expect(page.locator("#as-one")).to_be_hidden()
+        page.locator("[data-path=frames]").click()
+        page.locator("#as-one").click()
+        expect(page.locator("#source-facts")).to_contain_text("5 frames · 144 × 160 px")
+        expect(page.locator("#source-facts")).to_contain_text("5 files")
+
+
 def test_a_movie_is_chosen_looked_at_and_measured_from_the_page(chromium, tmp_path):
     scene = Scene(n_frames=12)
     (tmp_path / "2026-11").mkdir()

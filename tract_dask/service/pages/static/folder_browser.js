@@ -28,6 +28,7 @@ export class FolderBrowser {
     this.next = null;
     this.crumbs = h("nav", { class: "crumbs", "aria-label": "Folder" });
     this.filter = h("input", { class: "input", type: "search", placeholder: "Filter by name", "aria-label": "Filter by name", autocomplete: "off", oninput: () => this.show() });
+    this.asOne = h("button", { type: "button", class: "button", id: "as-one", hidden: true, title: "The files of the folder, in the order of the numbers in their names", onclick: () => this.onMovie(this.path) }, "Open the folder as one movie");
     this.body = h("tbody", {});
     this.note = h("div", {});
     this.scroll = h("div", { class: "files scroll" },
@@ -36,7 +37,7 @@ export class FolderBrowser {
         this.body),
       this.note);
     this.typed = h("input", { class: "input mono", id: "typed", autocomplete: "off", spellcheck: "false", placeholder: "folder/file.h5::/path/in/file, a folder of images, or scan_*.tif" });
-    element.replaceChildren(h("div", { class: "browse-bar" }, this.crumbs, this.filter), this.scroll,
+    element.replaceChildren(h("div", { class: "browse-bar" }, this.crumbs, this.filter, this.asOne), this.scroll,
       h("form", { class: "by-hand", onsubmit: (event) => this.takeTyped(event) },
         h("div", { class: "field" }, h("label", { for: "typed" }, "Or type a path under the data root"), this.typed),
         h("button", { class: "button" }, "Open")));
@@ -103,7 +104,8 @@ export class FolderBrowser {
     const seen = this.entries.filter((entry) => entry.name.toLowerCase().includes(wanted));
     this.body.replaceChildren(...seen.map((entry) => this.row(entry)));
     const movies = seen.filter((entry) => entry.kind === "movie").length;
-    const empty = wanted ? "Nothing here has this in its name." : "This folder is empty. Put a movie into it: TIFF, MRC, HDF5, .npy, raw, or a folder of images.";
+    this.asOne.hidden = !this.path || movies < 2;
+    const empty = wanted ? "Nothing here has this in its name." : "This folder is empty. Put a movie into it: DM4, TIFF, MRC, EMD, SER, TVIPS, SEQ, MIB, HDF5, Zarr, .npy, raw, or a folder of images.";
     this.note.replaceChildren(seen.length ? h("p", { class: "sr", "aria-live": "polite" }, `${several(seen.length, "entry", "entries")}, ${several(movies, "movie")}`) : h("p", { class: "empty" }, this.next ? "None of those that were read so far." : empty),
       this.next ? h("button", { type: "button", class: "button", onclick: (/** @type {Event & { currentTarget: HTMLButtonElement }} */ event) => this.more(event.currentTarget) }, `Show more than ${this.entries.length} entries`) : "");
   }
