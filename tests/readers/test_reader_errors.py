@@ -46,7 +46,7 @@ def test_missing_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("movie.dm4", ("DigitalMicrograph files are not read yet", ".tif", "got .dm4", "Export")),
+        ("movie.ser", ("TIA files are not read yet", ".tif", "got .ser", "Export")),
         ("movie.emd", ("EMD files are not read yet",)),
         ("movie.ser", ("TIA files are not read yet",)),
         ("movie.avi", ("format is unknown", ".mrc", "got .avi", "--raw-shape")),

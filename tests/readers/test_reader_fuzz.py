@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 import tifffile
 
+from tests.helpers.files_dm import write_director, write_dm
 from tract_dask.errors import TractError
 from tract_dask.readers import open_source
 from tract_dask.settings import SourceSettings
 
 FRAMES = np.random.default_rng(1).poisson(5, (5, 40, 36)).astype("u2")
 DECLARED = SourceSettings(raw_shape=(0, 40, 36), raw_dtype="uint16")
+LENGTHS = [(0.05, "nm"), (0.05, "nm"), (0.25, "s")]
 CASES = 20
 """Mutations of each base in the suite; the same functions ran over 10,000 (see docs/reliability.md)."""
 
@@ -126,6 +128,12 @@ BASES: dict[str, Callable[[Path], object]] = {
     "links.h5": links,
     "emd.h5": emd,
     "movie.hspy": hyperspy,
+    "stack.dm3": lambda path: write_dm(path, FRAMES, LENGTHS, order=">"),
+    "stack.dm4": lambda path: write_dm(path, FRAMES, LENGTHS, {"DataBar": {"Exposure Time (s)": 0.1}}),
+    "across.dm4": lambda path: write_dm(path, np.moveaxis(FRAMES, 0, 2), LENGTHS[::-1]),
+    "stack.dm5": lambda path: write_dm(path, FRAMES, LENGTHS),
+    "director.dm4": lambda path: write_director(path, FRAMES, (5000, 9000)),
+    "director.dm5": lambda path: write_director(path, FRAMES, (5000, 9000)),
     "movie.raw": lambda path: path.write_bytes(FRAMES.tobytes()),
 }
 HOSTILE = (0, 1, 2, 3, 7, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1)

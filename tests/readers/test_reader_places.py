@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from tests.helpers.files_dm import write_dm
 from tract_dask.errors import InputError, SourceError
 from tract_dask.readers import READERS, open_cached, open_source
 from tract_dask.settings import SourceSettings
@@ -45,6 +46,8 @@ def write(path: Path) -> Path:
         header = np.zeros(256, "<i4")
         header[:4] = *FRAMES.shape[::-1], 6
         path.write_bytes(header.tobytes() + FRAMES.tobytes())
+    elif suffix in (".dm3", ".dm4", ".dm5"):
+        write_dm(path, FRAMES)
     else:
         path.write_bytes(FRAMES.tobytes())
     return path

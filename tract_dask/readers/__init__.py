@@ -18,11 +18,11 @@ from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
+from . import gatan
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
 from .npy import open_npy
-from .raw import open_raw
 from .registry import Reader, by_suffix
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
@@ -48,7 +48,10 @@ BUILT_IN = (
     Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc),
     Reader("NumPy", (".npy",), open_npy),
     Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
-    Reader("raw", (".raw", ".bin", ".dat"), open_raw),
+    Reader(
+        "DigitalMicrograph", gatan.SUFFIXES, gatan.open_gatan, inside="the number of an image", is_movie=gatan.is_movie
+    ),
+    Reader("raw", (".raw", ".bin", ".dat"), gatan.open_raw_or_movie, is_part=gatan.is_part),
 )
 """The formats that are read here."""
 
@@ -77,7 +80,7 @@ AS_THE_FILE_SAYS = MetadataSettings()
 
 _RAW = READERS[".raw"]
 
-_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
+_VENDORS = {".ser": "TIA", ".emd": "EMD"}
 
 
 def open_source(
@@ -178,7 +181,8 @@ def is_movie_folder(place: Path) -> bool:
 
 
 def _reader_of_folder(place: Path) -> Reader | None:
-    return next((reader for reader in READERS.values() if reader.is_movie(place)), None) if place.is_dir() else None
+    readers = dict.fromkeys(READERS.values()) if place.is_dir() else {}
+    return next((reader for reader in readers if reader.is_movie(place)), None)
 
 
 def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, ...]] | None:
@@ -191,7 +195,7 @@ def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, 
     SourceError
         Where a folder holds files of several formats now, or cannot be read.
     """
-    if source.listed or not isinstance(source, SequenceSource):
+    if source.listed or not isinstance(source, SequenceSource) or is_movie_folder(Path(_split(source.path)[0])):
         return None
     with reading(source.path):
         found = list_files(source.path, Path(_split(source.path)[0]), READERS)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from .source import (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BlockSource(Source):
-    """Frames at known places in one file.
+    """Frames at known places in one file, or in several that are one long row of bytes.
 
     Attributes
     ----------
@@ -33,15 +35,27 @@ class BlockSource(Source):
         Position of each frame's first byte.
     stored
         Pixel type as stored, with its byte order.
+    firsts
+        Position of the first byte of each file; a frame may cross from one into the next.
     """
 
     offsets: NDArray[np.int64]
     stored: np.dtype[Any]
+    firsts: tuple[int, ...] = (0,)
 
     @property
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return True
+
+    def files_of(self, start: int, stop: int) -> slice:
+        """Return which of ``files`` hold frames ``start`` to ``stop`` (not included)."""
+        if len(self.firsts) == 1 or stop <= start:
+            return slice(None)
+        n_bytes = self.shape[1] * self.shape[2] * self.stored.itemsize
+        places = self.offsets[start:stop]
+        last = bisect_right(self.firsts, int(places.max()) + n_bytes - 1)
+        return slice(bisect_right(self.firsts, int(places.min())) - 1, last)
 
     def _read(self, start: int, stop: int) -> Frames:
         frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
@@ -70,9 +84,18 @@ class BlockSource(Source):
             return
         offsets = self.offsets[start : start + len(frames)]
         breaks = np.flatnonzero(np.diff(offsets) != frames[0].nbytes) + 1
-        with self.files[0].open("rb", buffering=0) as file:
+        with ExitStack() as stack:
+            opened: dict[int, Any] = {}
             for first, last in pairwise((0, *breaks.tolist(), len(offsets))):
-                fill_from(file, int(offsets[first]), frames[first:last], self.files[0])
+                at, rest = int(offsets[first]), frames[first:last].reshape(-1).view(np.uint8)
+                while len(rest):
+                    number = bisect_right(self.firsts, at) - 1
+                    if number not in opened:
+                        opened[number] = stack.enter_context(self.files[number].open("rb", buffering=0))
+                    until = self.firsts[number + 1] if number + 1 < len(self.firsts) else at + len(rest)
+                    part = rest[: until - at]
+                    fill_from(opened[number], at - self.firsts[number], part, self.files[number])
+                    at, rest = at + len(part), rest[len(part) :]
 
 
 def open_block(
@@ -83,8 +106,9 @@ def open_block(
     stored: np.dtype[Any],
     offset: int,
     metadata: SourceMetadata = NOTHING_KNOWN,
+    parts: tuple[Path, ...] = (),
 ) -> BlockSource:
-    """Return the frames that lie one after the other in a file from byte ``offset`` on.
+    """Return the frames that lie one after the other in a file from byte ``offset`` on, and go on in ``parts``.
 
     Raises
     ------
@@ -94,19 +118,21 @@ def open_block(
     dtype = checked_dtype(stored, str(path))
     n_frames, n_y, n_x = checked_shape(shape, str(path))
     frame_bytes = n_y * n_x * stored.itemsize
-    size = path.stat().st_size
+    sizes = [file.stat().st_size for file in (path, *parts)]
+    size = sum(sizes)
     if size < offset + n_frames * frame_bytes:
         n_whole = max(0, size - offset) // frame_bytes
         raise truncated(str(path), f"in frame {n_whole} of {n_frames}", offset + n_frames * frame_bytes, size)
     return BlockSource(
         path=str(path),
-        files=(path,),
+        files=(path, *parts),
         format=name,
         shape=(n_frames, n_y, n_x),
         dtype=dtype,
         metadata=metadata,
         offsets=offset + frame_bytes * np.arange(n_frames, dtype=np.int64),
         stored=stored,
+        firsts=tuple(accumulate(sizes[:-1], initial=0)),
     )
 
 
