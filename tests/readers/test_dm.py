@@ -225,8 +225,8 @@ def test_damage_ends_soon(tmp_path: Path) -> None:
     nested: dict[str, Any] = {}
     for _ in range(99):
         nested = {"a": nested}
-    write_tags(path, nested)
-    refused(path, "nested too deeply")
+    refused(write_tags(path, nested, 3), "nested too deeply")
+    refused(write_tags(path, nested, 4), "the file holds no image")
     write_dm(path, FRAMES)
     whole = path.read_bytes()
     began = time.process_time()
@@ -242,6 +242,18 @@ def test_damage_ends_soon(tmp_path: Path) -> None:
     path.write_bytes(bytes(1 << 20))
     refused(path, "not a DigitalMicrograph file")
     assert time.process_time() - began < 2
+
+
+def test_a_damaged_tag_of_a_dm4_file_is_passed_over_and_named(tmp_path: Path) -> None:
+    path = write_dm(tmp_path / "a.dm4", FRAMES, LENGTHS, {"Other": {"damaged": 1.0}})
+    whole = path.read_bytes()
+    at = whole.index(b"damaged") + len(b"damaged") + 8
+    path.write_bytes(whole[:at] + b"!" + whole[at + 1 :])
+    source = open_source(path)
+    np.testing.assert_array_equal(source.read(0, 5), FRAMES)
+    assert source.metadata.notes == ("a.dm4: these tags are damaged and were passed over: damaged",)
+    (tmp_path / "a.dm3").write_bytes(write_dm(tmp_path / "a.dm3", FRAMES).read_bytes().replace(b"%%%%", b"%!%%", 1))
+    refused(tmp_path / "a.dm3", "does not begin as values do")
 
 
 def test_tags_are_read_whole(tmp_path: Path) -> None:

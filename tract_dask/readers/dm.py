@@ -14,7 +14,8 @@ from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import open_block
 from .dm5_tags import read_dm5
-from .dm_image import Image, calibration, chosen, frame_axis, stage_tilt, started, stored_type
+from .dm_calibration import calibration, stage_tilt, started
+from .dm_image import Image, chosen, frame_axis, stored_type
 from .dm_tags import Array, Tags, read_tags
 from .hdf5 import open_hdf5
 from .source import (
@@ -107,6 +108,8 @@ def read_document(path: Path, permit: Permit | None) -> Document:
     found = read_tags(path)
     after = path.stat().st_size - found.end - _AFTER
     notes = (f"{path.name}: {after:,} bytes after its last tag are not read",) if after > 0 else ()
+    if found.lost:
+        notes += (f"{path.name}: these tags are damaged and were passed over: {', '.join(found.lost[:9])}",)
     return Document(path, f"DM{found.version}", found.tags, found.order, notes=notes)
 
 

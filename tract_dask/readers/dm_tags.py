@@ -15,7 +15,7 @@ from .source import truncated
 Tags: TypeAlias = dict[str, Any]
 """Tags by their names, entries without one by ``[0]``, ``[1]`` ...: numbers, text, an Array, or Tags again."""
 
-_MOST_TAGS, _DEEPEST, _LONGEST_TEXT, _MOST_TYPES = 500_000, 64, 1 << 16, 1 << 12
+_MOST_TAGS, _DEEPEST, _LONGEST_TEXT, _MOST_TYPES = 200_000, 64, 1 << 16, 1 << 12
 """More are a damaged file."""
 
 _GROUP, _VALUE = 20, 21
@@ -43,12 +43,27 @@ class Array:
 
 @dataclass(frozen=True)
 class TagFile:
-    """The tags of a file, and the order of bytes of its values (``<`` or ``>``), and where the last tag ends."""
+    """The tags of a file.
+
+    Attributes
+    ----------
+    version
+        3 or 4.
+    order
+        Of bytes in values, ``<`` or ``>``.
+    tags
+        From the root on.
+    end
+        Where the last tag ends.
+    lost
+        The names of tags that are damaged and missing here.
+    """
 
     version: int
     order: str
     tags: Tags
     end: int
+    lost: tuple[str, ...] = ()
 
 
 def read_tags(path: Path) -> TagFile:
@@ -76,7 +91,7 @@ def read_tags(path: Path) -> TagFile:
         file.seek(order_at + 4)
         walk = _Walk(file, str(path), size, order, wide=version == 4)
         tags = walk.group(0)
-        return TagFile(version, order, tags, file.tell())
+        return TagFile(version, order, tags, file.tell(), tuple(dict.fromkeys(walk.lost)))
 
 
 class _Walk:
@@ -87,6 +102,7 @@ class _Walk:
         self.wide = wide
         self.word, self.word_bytes = (">Q", 8) if wide else (">I", 4)
         self.n_tags = 0
+        self.lost: list[str] = []
 
     def group(self, depth: int) -> Tags:
         """Return the tags of the group that begins here."""
@@ -103,10 +119,20 @@ class _Walk:
             name = self._take(length).decode("latin-1")
             if not name:
                 name, unnamed = f"[{unnamed}]", unnamed + 1
-            if self.wide:
-                self._take(8)  # the bytes of this tag, which its content says again
-            found.setdefault(name, self._content(kind, depth))
+            n_bytes = struct.unpack(">Q", self._take(8))[0] if self.wide else self.size
+            found.setdefault(name, self._content_or_none(kind, depth, name, self.file.tell() + n_bytes))
         return found
+
+    def _content_or_none(self, kind: int, depth: int, name: str, end: int) -> Any:
+        """Return the content of a tag; None, and go to its end, where it is damaged but its length is known."""
+        try:
+            return self._content(kind, depth)
+        except SourceError:
+            if end > self.size or self.n_tags > _MOST_TAGS:
+                raise
+            self.lost.append(name)
+            self.file.seek(end)
+            return None
 
     def _content(self, kind: int, depth: int) -> Any:
         self.n_tags += 1

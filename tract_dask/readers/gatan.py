@@ -17,7 +17,8 @@ from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import open_block
 from .dm import Document, image_of, open_image, read_document
-from .dm_image import Image, calibration
+from .dm_calibration import calibration
+from .dm_image import Image
 from .dm_tags import number
 from .raw import open_raw
 from .sequence import natural_key, open_sequence
