@@ -177,6 +177,9 @@ def test_a_folder_of_single_frames_has_the_times_of_its_files(tmp_path: Path) ->
     np.testing.assert_allclose(source.metadata.along_frames["time"].values, moments)
     np.testing.assert_allclose(source.metadata.along_frames["stage_tilt"].values, np.array(moments) / 10)
     assert any("a gap of 1.5 s after frame 2" in note for note in source.metadata.notes)
+    for k in range(5):
+        write_dm(tmp_path / f"f_{k}.dm4", FRAMES[k], LENGTHS, stamped(0.04 * k))
+    assert open_source(tmp_path).metadata.frame_time_s == 0.04
 
 
 @pytest.mark.parametrize("moments", [[3.0] * 5, [0.0, 1.0, 0.5, 2.0, 3.0]])

@@ -148,6 +148,7 @@ def test_folders_by_hour_minute_and_second(tags: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(source.read(0, 12), FRAMES)
     assert (source.metadata.frame_time_s, source.metadata.pixel_size_pm) == (0.25, 10)
     assert "time" not in source.metadata.along_frames
+    assert "not tested with a file from a camera" in source.metadata.notes[0]
     assert set(source.files) <= set(asked)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(source)).read(3, 9), FRAMES[3:9])
     assert files_named_now(source) is None

@@ -95,7 +95,7 @@ def started(image: Image) -> float | None:
     stamp = number(image.tags, "ImageTags", "DataBar", "Acquisition Time (OS)")
     if stamp is None or not 1e17 < stamp < 2e17:  # 1917 to 2234
         return None
-    return float(stamp) / 1e7 - _EPOCH_S
+    return round(float(stamp) / 1e7 - _EPOCH_S, 5)  # as a float64 it is exact to 2 microseconds
 
 
 def stage_tilt(image: Image) -> float | None:

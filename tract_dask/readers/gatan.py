@@ -235,7 +235,8 @@ def _open_seconds(folder: Path, inner: str, settings: SourceSettings, permit: Pe
     found = sorted(_below(folder, 0.0, 0, permit), key=lambda item: (item[0], natural_key(item[1].name)))
     open_file = partial(_open_frame, inner=inner, settings=settings, permit=permit)
     source = open_sequence(str(folder), [file for _, file in found], open_file)
-    known = source.metadata
+    known = replace(source.metadata, notes=(untested("Gatan in-situ folders", str(folder)), *source.metadata.notes))
+    source = replace(source, metadata=known)
     if "time" in known.along_frames or source.shape[0] != len(found):
         return source
     times = _times([second for second, _ in found], known.frame_time_s, str(folder))
