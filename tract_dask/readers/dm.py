@@ -16,7 +16,7 @@ from .blocks import open_block
 from .dm5_tags import read_dm5
 from .dm_calibration import calibration, stage_tilt, started
 from .dm_image import Image, chosen, frame_axis, stored_type
-from .dm_tags import Array, Tags, read_tags
+from .dm_tags import Array, TagFile, Tags, read_tags
 from .hdf5 import open_hdf5
 from .source import (
     Frames,
@@ -106,11 +106,18 @@ def read_document(path: Path, permit: Permit | None) -> Document:
         tags, types = read_dm5(path, permit)
         return Document(path, "DM5", tags, "<", types, (untested("DM5", path.name),))
     found = read_tags(path)
+    return Document(path, f"DM{found.version}", found.tags, found.order, notes=_of_tags(found, path))
+
+
+def _of_tags(found: TagFile, path: Path) -> tuple[str, ...]:
+    """Return notes on what of a file is not read."""
     after = path.stat().st_size - found.end - _AFTER
-    notes = (f"{path.name}: {after:,} bytes after its last tag are not read",) if after > 0 else ()
+    notes = []
+    if after > 0:
+        notes.append(f"{path.name}: {after:,} bytes after its last tag are not read")
     if found.lost:
-        notes += (f"{path.name}: these tags are damaged and were passed over: {', '.join(found.lost[:9])}",)
-    return Document(path, f"DM{found.version}", found.tags, found.order, notes=notes)
+        notes.append(f"{path.name}: these tags are damaged and were passed over: {', '.join(found.lost[:9])}")
+    return tuple(notes)
 
 
 def image_of(document: Document, inner: str) -> tuple[Image, tuple[str, ...]]:
