@@ -10,14 +10,14 @@ import h5py
 import numpy as np
 
 from ..errors import SourceError
+from .dm_image import COLOURS, COMPLEX, TYPES
 from .dm_tags import Array, Tags
 from .hdf5_links import DAMAGE, Access, opened
 from .source import Permit
 
 _MOST_TAGS, _DEEPEST, _LONGEST = 50_000, 64, 1 << 16
 
-_TYPES = {"i2": 1, "f4": 2, "u1": 6, "i4": 7, "i1": 9, "u2": 10, "u4": 11, "f8": 12, "b1": 14, "i8": 39, "u8": 40}
-_COLOURS, _COMPLEX = 23, 3
+_CODES = {name: code for code, name in TYPES.items()}
 
 
 def read_dm5(path: Path, permit: Permit | None) -> tuple[Tags, dict[int, np.dtype[Any]]]:
@@ -57,9 +57,9 @@ def _described(tags: Tags, dataset: Any) -> Tags:
         "Dimensions": {f"[{k}]": int(size) for k, size in enumerate(reversed(shape))},
         "PixelDepth": stored.itemsize,
     }
-    if tags.get("DataType") in (_COLOURS, 8):
+    if tags.get("DataType") in COLOURS:
         return found
-    code = _TYPES.get(stored.str[1:]) or {"c": _COMPLEX, "V": _COLOURS}.get(stored.kind)
+    code = _CODES.get(stored.str[1:]) or {"c": COMPLEX[0], "V": COLOURS[0]}.get(stored.kind)
     return found | ({"DataType": code} if code else {})
 
 

@@ -13,8 +13,9 @@ from ..errors import SourceError
 from .dm_tags import Array, Tags, entries, number, text, value
 from .units import to_pm, to_seconds
 
-_TYPES = {1: "i2", 2: "f4", 6: "u1", 7: "i4", 9: "i1", 10: "u2", 11: "u4", 12: "f8", 14: "?", 39: "i8", 40: "u8"}
-_KINDS = dict.fromkeys((3, 5, 13, 27, 28), "complex numbers") | dict.fromkeys((8, 23), "RGB colours")
+TYPES: dict[float | None, str] = {1: "i2", 2: "f4", 6: "u1", 7: "i4", 9: "i1", 10: "u2", 11: "u4", 12: "f8", 14: "b1"}
+TYPES |= {39: "i8", 40: "u8"}
+COLOURS, COMPLEX = (8, 23), (3, 5, 13, 27, 28)
 """DigitalMicrograph's numbers of pixel types."""
 
 _MOST_AXES = 16
@@ -78,8 +79,10 @@ class Image:
     def kind(self) -> str:
         """What its pixels are where they are not intensities, in words; empty where they are."""
         data_type = number(self.tags, "ImageData", "DataType")
-        if data_type in _KINDS:
-            return f"the pixels are {_KINDS[int(data_type)]}"
+        if data_type in COLOURS:
+            return "the pixels are RGB colours"
+        if data_type in COMPLEX:
+            return "the pixels are complex numbers"
         form = text(self.tags, "ImageTags", "Meta Data", "Format").lower()
         if form.startswith("spectrum") or any(axis.is_energy for axis in self.axes):
             return "this is a spectrum, or an image of spectra"
@@ -157,9 +160,7 @@ def _axes(tags: Tags) -> tuple[Axis, ...]:
     sizes = [size for _, size in entries(tags, "ImageData", "Dimensions")][:_MOST_AXES]
     calibrations = dict(entries(tags, "ImageData", "Calibrations", "Dimension"))
     axes = [_axis(int(size) if isinstance(size, int) else 0, calibrations.get(k)) for k, size in enumerate(sizes)]
-    while len(axes) > 2 and axes[-1].size == 1:
-        axes.pop()
-    return tuple(axes)
+    return (*axes[:2], *(axis for axis in axes[2:] if axis.size != 1))
 
 
 def _axis(size: int, calibration: object) -> Axis:
@@ -194,15 +195,16 @@ def stored_type(image: Image, order: str) -> np.dtype[Any]:
             "Save one slice of it from DigitalMicrograph as a stack",
         )
     data_type = number(image.tags, "ImageData", "DataType")
-    if data_type not in _TYPES:
+    name = TYPES.get(data_type)
+    if name is None:
         raise SourceError(
             "the type of the pixels is unknown",
             image.place,
-            ", ".join(f"{code} ({name})" for code, name in _TYPES.items()),
+            ", ".join(f"{code} ({known})" for code, known in TYPES.items()),
             f"data type {data_type}",
             "Save the image from DigitalMicrograph as Real (4 byte)",
         )
-    stored = np.dtype(_TYPES[int(data_type)]).newbyteorder(order)  # type: ignore[arg-type]
+    stored = np.dtype(name).newbyteorder(order)  # type: ignore[arg-type]
     _check_bytes(image, stored)
     return stored
 
