@@ -13,9 +13,12 @@ import typing
 from pathlib import Path
 
 import pytest
+from conftest import Scene
+from files_dm import write_dm
 
 from tract_dask.settings import RunSettings
 from tract_dask.simulate.movie import simulate_movie
+from tract_dask.store.results import open_results
 
 ROOT = Path(__file__).parents[1]
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -123,6 +126,23 @@ def test_commands_and_examples_of_the_readme(folder):
         for path in re.findall(r"`(.*?)`", name):
             assert (folder / "out" / path).exists(), path
     call(sys.executable, "-c", "\n".join(blocks("README.md", "python")), folder=folder)
+
+
+@pytest.mark.slow
+def test_a_first_movie_from_a_dm4_file_to_a_figure(tmp_path):
+    scene = Scene()
+    write_dm(tmp_path / "movie.dm4", scene.counts(), [(8e-3, "nm"), (8e-3, "nm"), (0.5, "s")])
+    for block in blocks("docs/first_movie.md", "bash"):
+        if "serve" not in block:
+            call("bash", "-euo", "pipefail", "-c", block, folder=tmp_path)
+    said = call(sys.executable, "-c", "\n".join(blocks("docs/first_movie.md", "python")), folder=tmp_path)
+    assert "moves most" in said
+    tracks = open_results(tmp_path / "out" / "results.zarr")
+    assert (tracks.attrs["pixel_size_pm"], tracks.attrs["frame_time_s"]) == (8.0, 0.5)
+    assert tracks.sizes["column_id"] == len(scene.place)
+    for name in re.findall(r"`(out/[\w./]+)`", (ROOT / "docs" / "first_movie.md").read_text(encoding="utf-8")):
+        assert (tmp_path / name).exists(), name
+    assert (tmp_path / "tracks.csv").exists()
 
 
 @pytest.mark.slow

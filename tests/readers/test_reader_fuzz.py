@@ -16,12 +16,14 @@ import tifffile
 from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
+from tests.helpers.files_dm import write_director, write_dm
 from tract_dask.errors import TractError
 from tract_dask.readers import open_source
 from tract_dask.settings import SourceSettings
 
 FRAMES = np.random.default_rng(1).poisson(5, (5, 40, 36)).astype("u2")
 DECLARED = SourceSettings(raw_shape=(0, 40, 36), raw_dtype="uint16")
+LENGTHS = [(0.05, "nm"), (0.05, "nm"), (0.25, "s")]
 CASES = 20
 """Mutations of each base in the suite; the same functions ran over 10,000 (see docs/reliability.md)."""
 
@@ -131,6 +133,12 @@ BASES: dict[str, Callable[[Path], object]] = {
     "raw.avi": lambda path: write_video(path, FRAMES.astype("u1"), "rawvideo"),
     "h264.mp4": lambda path: write_video(path, FRAMES.astype("u1"), "libx264", "yuv420p"),
     "png.mov": lambda path: write_video(path, FRAMES.astype("u1"), "png"),
+    "stack.dm3": lambda path: write_dm(path, FRAMES, LENGTHS, order=">"),
+    "stack.dm4": lambda path: write_dm(path, FRAMES, LENGTHS, {"DataBar": {"Exposure Time (s)": 0.1}}),
+    "across.dm4": lambda path: write_dm(path, np.moveaxis(FRAMES, 0, 2), LENGTHS[::-1]),
+    "stack.dm5": lambda path: write_dm(path, FRAMES, LENGTHS),
+    "director.dm4": lambda path: write_director(path, FRAMES, (5000, 9000)),
+    "director.dm5": lambda path: write_director(path, FRAMES, (5000, 9000)),
     "movie.raw": lambda path: path.write_bytes(FRAMES.tobytes()),
     "small.ser": lambda path: write_ser(path, FRAMES, planned=7),
     "large.ser": lambda path: write_ser(path, FRAMES, version=0x0220, axes=[(5, 0.5, "Time", "s")]),

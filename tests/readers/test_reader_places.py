@@ -17,6 +17,7 @@ import tifffile
 from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
+from tests.helpers.files_dm import write_dm
 from tract_dask.errors import InputError, SourceError
 from tract_dask.readers import READERS, open_cached, open_source
 from tract_dask.settings import SourceSettings
@@ -54,6 +55,8 @@ def write(path: Path) -> Path:
         path.write_bytes(header.tobytes() + FRAMES.tobytes())
     elif suffix in (".ser", ".tvips", ".seq", ".mib"):
         {".ser": write_ser, ".tvips": write_tvips, ".seq": write_seq, ".mib": write_mib}[suffix](path, FRAMES)
+    elif suffix in (".dm3", ".dm4", ".dm5"):
+        write_dm(path, FRAMES)
     else:
         path.write_bytes(FRAMES.tobytes())
     return path

@@ -9,9 +9,12 @@ from itertools import product
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 
+from tests.helpers.files_dm import write_seconds
 from tract_dask.errors import InputError, MissingStoreError
+from tract_dask.readers import open_source
 from tract_dask.readers.listing import FileList
 from tract_dask.service.app import create_app
 from tract_dask.service.config import ServiceConfig
@@ -131,6 +134,21 @@ def test_what_lies_inside_is_found(root):
         data.relative(real.parent / "secret.tif")
     with pytest.raises(MissingStoreError, match="no such file"):
         data.resolve("jobs/new")
+
+
+def test_a_folder_that_is_one_movie_is_named_as_a_whole(tmp_path):
+    frames = np.arange(4 * 5 * 6, dtype="u2").reshape(4, 5, 6)
+    write_seconds(tmp_path / "run", frames, [2, 2])
+    data = DataRoot(tmp_path)
+    place = data.source("run")
+    assert place == f"{data.path}/run"
+    np.testing.assert_array_equal(open_source(place, permit=data.permit).read(0, 4), frames)
+    write_seconds(tmp_path / "out/of", frames, [4])
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root/run").mkdir()
+    (tmp_path / "root/run/Hour_00").symlink_to(tmp_path / "out/of/Hour_00")
+    with pytest.raises(OutsideError):
+        DataRoot(tmp_path / "root").source("run")
 
 
 def test_a_data_root_may_be_a_link_itself(root, tmp_path):

@@ -18,13 +18,12 @@ from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
-from . import video
+from . import gatan, video
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
 from .merlin import is_header_of_mib, open_merlin
 from .mrc import open_mrc
 from .npy import open_npy
-from .raw import open_raw
 from .recipes import unknown_format
 from .registry import Reader, by_suffix
 from .selection import select
@@ -59,7 +58,10 @@ BUILT_IN = (
     Reader("TVIPS", (".tvips",), open_tvips, is_part=is_later_part),
     Reader("StreamPix", (".seq",), open_seq),
     Reader("Merlin", (".mib", ".hdr"), open_merlin, is_part=is_header_of_mib),
-    Reader("raw", (".raw", ".bin", ".dat"), open_raw),
+    Reader(
+        "DigitalMicrograph", gatan.SUFFIXES, gatan.open_gatan, inside="the number of an image", is_movie=gatan.is_movie
+    ),
+    Reader("raw", (".raw", ".bin", ".dat"), gatan.open_raw_or_movie, is_part=gatan.is_part),
 )
 """The formats that are read here."""
 
@@ -190,7 +192,8 @@ def is_movie_folder(place: Path) -> bool:
 
 
 def _reader_of_folder(place: Path) -> Reader | None:
-    return next((reader for reader in READERS.values() if reader.is_movie(place)), None) if place.is_dir() else None
+    readers = dict.fromkeys(READERS.values()) if place.is_dir() else {}
+    return next((reader for reader in readers if reader.is_movie(place)), None)
 
 
 def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, ...]] | None:
@@ -203,7 +206,7 @@ def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, 
     SourceError
         Where a folder holds files of several formats now, or cannot be read.
     """
-    if source.listed or not isinstance(source, SequenceSource):
+    if source.listed or not isinstance(source, SequenceSource) or is_movie_folder(Path(_split(source.path)[0])):
         return None
     with reading(source.path):
         found = list_files(source.path, Path(_split(source.path)[0]), READERS)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingSourceError, SourceError
-from .source import Frames, Source
+from .source import Frames, FrameValues, Source, SourceMetadata
+from .times import timed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,14 +72,14 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
             "the movie has no frames", path, "at least one file to read", "none", "Check the folder or the pattern"
         )
     first = open_file(files[0])
-    lengths, behind = [first.shape[0]], dict.fromkeys(first.files)
+    parts, behind = [first], dict.fromkeys(first.files)
     for file in files[1:]:
         part = open_file(file)
         _check_alike(part, first.shape, first.dtype, files[0].name)
-        lengths.append(part.shape[0])
+        parts.append(part)
         behind.update(dict.fromkeys(part.files))
-    firsts = np.cumsum([0, *lengths])
-    metadata = first.metadata
+    firsts = np.cumsum([0, *(part.shape[0] for part in parts)])
+    metadata = _joined(parts, path)
     return SequenceSource(
         path=path,
         files=tuple(behind),
@@ -91,6 +92,40 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
         inside=first.inside,
         open_file=open_file,
     )
+
+
+def _joined(parts: list[Source], where: str) -> SourceMetadata:
+    """Return what the first file says, and along the frames what all of them say; times by their moments."""
+    first = parts[0].metadata
+    if len(parts) == 1:
+        return first
+    names = set.intersection(*(set(part.metadata.along_frames) for part in parts)) - {"time"}
+    along = {
+        name: FrameValues(
+            np.concatenate([part.metadata.along_frames[name].values for part in parts]), first.along_frames[name].units
+        )
+        for name in sorted(names)
+    }
+    stamps = np.concatenate([_stamps(part) for part in parts])
+    if not np.isfinite(stamps).all() or (stamps == stamps[0]).all():
+        return replace(first, along_frames=along)
+    times = timed(np.round(stamps - stamps[0], 6), where)
+    return replace(
+        first,
+        frame_time_s=times.frame_time_s or first.frame_time_s,
+        notes=first.notes + times.notes,
+        along_frames=along | dict(times.along_frames),
+    )
+
+
+def _stamps(part: Source) -> NDArray[np.float64]:
+    """Return the moments of a file's frames in seconds since 1970; NaN where the file does not say."""
+    known = part.metadata
+    began = np.nan if known.start_s is None else known.start_s
+    if "time" in known.along_frames:
+        return began + known.along_frames["time"].values
+    step = np.nan if known.frame_time_s is None else known.frame_time_s
+    return np.array([began + (number * step if number else 0.0) for number in range(part.shape[0])])
 
 
 def _check_alike(part: Source, shape: tuple[int, int, int], dtype: np.dtype[Any], first: str) -> None:
@@ -130,8 +165,8 @@ def gaps(names: list[str]) -> tuple[str, ...]:
     if len(varying) != 1:
         return ()
     steps = [after - before for before, after in pairwise(varying[0])]
-    usual = min(step for step in steps if step > 0)
-    wide = [number for number, step in enumerate(steps) if step > usual]
+    usual = min((step for step in steps if step > 0), default=0)
+    wide = [number for number, step in enumerate(steps) if step > usual > 0]
     if not wide:
         return ()
     more = f" (and {len(wide) - 1} more)" if len(wide) > 1 else ""

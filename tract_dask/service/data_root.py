@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 from ..errors import DestinationError, InputError, MissingStoreError, StoreError
-from ..readers import READERS
+from ..readers import READERS, is_movie_folder
 from ..readers.listing import WILD, FileList, list_files
 from ..readers.recipes import unknown_format
 from ..store import metadata
@@ -225,7 +225,7 @@ class DataRoot:
             return f"{place}{sign}{inner}"
         if place.is_file():
             _check_format(place)
-        elif place.suffix == ".zarr":
+        elif place.suffix == ".zarr" or is_movie_folder(place):
             self.check_links(place)
         else:
             return self._listed(place, f"{sign}{inner}")
