@@ -41,7 +41,7 @@ def write(path: Path) -> Path:
     elif suffix in (".h5", ".hdf5", ".hspy"):
         with h5py.File(path, "w") as file:
             file["data"] = FRAMES
-    elif suffix in (".mrc", ".mrcs", ".st"):
+    elif suffix in (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"):
         header = np.zeros(256, "<i4")
         header[:4] = *FRAMES.shape[::-1], 6
         path.write_bytes(header.tobytes() + FRAMES.tobytes())

@@ -413,6 +413,24 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
+def unaccounted(where: str, n_bytes: int, frame_bytes: int) -> tuple[str, ...]:
+    """Return a note where a file holds bytes, a frame of them or 4096, that its header does not account for."""
+    if n_bytes < min(max(1, frame_bytes), 4096):
+        return ()
+    return (
+        f"{where} holds {n_bytes:,} bytes, as many as {n_bytes / max(1, frame_bytes):.3g} frames, that its header does"
+        " not account for; they are not read",
+    )
+
+
+def untested(name: str, where: str) -> str:
+    """Return the note for a format that was never tested with a camera's file."""
+    return (
+        f"{where}: this reader of {name} was not tested with a file from a camera; compare a frame with the vendor's"
+        " program"
+    )
+
+
 def truncated(where: str, place: str, expected: int, got: int) -> SourceError:
     """Return the error for a file that ends too early; ``expected`` and ``got`` are in bytes."""
     return SourceError(
