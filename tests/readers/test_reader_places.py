@@ -34,7 +34,7 @@ def fails(path: Path | str, *words: str) -> None:
 
 def write(path: Path) -> Path:
     suffix = path.suffix
-    if suffix in (".tif", ".tiff"):
+    if suffix in (".tif", ".tiff", ".stk"):
         tifffile.imwrite(path, FRAMES, photometric="minisblack", compression="zlib" if suffix == ".tiff" else None)
     elif suffix == ".npy":
         np.save(path, FRAMES)

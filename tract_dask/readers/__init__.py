@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 BUILT_IN = (
-    Reader("TIFF", (".tif", ".tiff"), open_tiff),
+    Reader("TIFF", (".tif", ".tiff", ".stk"), open_tiff),
     Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc),
     Reader("NumPy", (".npy",), open_npy),
     Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),

@@ -33,10 +33,14 @@ class BlockSource(Source):
         Position of each frame's first byte.
     stored
         Pixel type as stored, with its byte order.
+    flipped
+        Bits that are the other way round than meant: all of them where white is 0, the highest where an offset makes
+        signed numbers positive.
     """
 
     offsets: NDArray[np.int64]
     stored: np.dtype[Any]
+    flipped: int = 0
 
     @property
     def one_by_one(self) -> bool:
@@ -55,10 +59,11 @@ class BlockSource(Source):
         self._check_exact(start, frames)
 
     def _fill(self, start: int, frames: Frames) -> None:
-        if self.stored.newbyteorder("=") == self.dtype:
+        if self.stored.newbyteorder("=") == self.dtype or self.flipped:
             self._fill_as_stored(start, frames)
-            if self.stored != self.dtype:
+            if self.stored.newbyteorder("=") != self.stored:
                 frames.byteswap(inplace=True)
+            flip(frames, self.flipped)
             return
         as_stored = np.empty((1, *self.shape[1:]), self.stored)
         for k in range(len(frames)):
@@ -73,6 +78,13 @@ class BlockSource(Source):
         with self.files[0].open("rb", buffering=0) as file:
             for first, last in pairwise((0, *breaks.tolist(), len(offsets))):
                 fill_from(file, int(offsets[first]), frames[first:last], self.files[0])
+
+
+def flip(frames: Frames, bits: int) -> None:
+    """Turn these bits of each pixel, in place; whole numbers only."""
+    if bits:
+        pixels = frames.view(f"u{frames.itemsize}")
+        pixels ^= pixels.dtype.type(bits)
 
 
 def open_block(

@@ -413,9 +413,9 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
-def unaccounted(where: str, n_bytes: int, frame_bytes: int) -> tuple[str, ...]:
-    """Return a note where a file holds bytes, a frame of them or 4096, that its header does not account for."""
-    if n_bytes < min(max(1, frame_bytes), 4096):
+def unaccounted(where: str, n_bytes: int, frame_bytes: int, least: int | None = None) -> tuple[str, ...]:
+    """Return a note where a file holds bytes, ``least`` or a frame of them, that its header does not account for."""
+    if n_bytes < max(1, frame_bytes if least is None else least):
         return ()
     return (
         f"{where} holds {n_bytes:,} bytes, as many as {n_bytes / max(1, frame_bytes):.3g} frames, that its header does"
