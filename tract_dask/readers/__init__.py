@@ -18,6 +18,7 @@ from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
+from .eer import open_eer
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
@@ -45,6 +46,7 @@ __all__ = [
 
 BUILT_IN = (
     Reader("TIFF", (".tif", ".tiff", ".stk"), open_tiff),
+    Reader("EER", (".eer",), open_eer, inside="how many readouts are summed into a frame"),
     Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc),
     Reader("NumPy", (".npy",), open_npy),
     Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
