@@ -171,7 +171,9 @@ def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None)
     if not isinstance(path, FileList) and (reader := _reader_of_folder(Path(outer))):
         return _opened(reader, Path(outer), inner, settings, permit)
     listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
-    return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
+    if listed is None:
+        return open_file(Path(outer))
+    return open_sequence(name, list(listed.files), open_file, references=listed.references)
 
 
 def is_movie_folder(place: Path) -> bool:
@@ -213,7 +215,7 @@ def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None
             "Name the same data set in each of them",
         )
     open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
-    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file, listed=True)
 
 
 def _split(name: str) -> tuple[str, str]:

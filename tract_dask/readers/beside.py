@@ -64,6 +64,7 @@ def merged(first: SourceMetadata, second: SourceMetadata, where: str) -> SourceM
         notes=notes,
         along_frames={**second.along_frames, **first.along_frames},
         references={**second.references, **first.references},
+        started_s=second.started_s if first.started_s is None else first.started_s,
     )
 
 

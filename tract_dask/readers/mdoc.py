@@ -88,7 +88,7 @@ def _of_frame_set(fields: Fields, n_frames: int, where: str) -> SourceMetadata:
     elif exposure > 0:
         seconds = float(f"{exposure / n_frames:.9g}")
     dose, more = _dose(fields.get("FrameDosesAndNumber", ""), n_frames, where)
-    return SourceMetadata(frame_time_s=seconds, dose=dose, notes=notes + more)
+    return SourceMetadata(frame_time_s=seconds, dose=dose, notes=notes + more, started_s=_started(fields))
 
 
 def _dose(text: str, n_frames: int, where: str) -> tuple[float | None, tuple[str, ...]]:
@@ -117,7 +117,14 @@ def _of_sections(sections: list[Fields], where: str) -> SourceMetadata:
         along["stage_tilt"] = FrameValues(tilts, "deg")
     doses = {number(section.get("ExposureDose")) for section in sections}
     dose = doses.pop() if len(doses) == 1 else math.nan
-    return replace(known, along_frames=along, dose=dose if 0 < dose < math.inf else None)
+    return replace(
+        known, along_frames=along, dose=dose if 0 < dose < math.inf else None, started_s=_started(sections[0])
+    )
+
+
+def _started(fields: Fields) -> float | None:
+    seconds = _seconds(fields.get("DateTime", ""))
+    return seconds if math.isfinite(seconds) else None
 
 
 def _seconds(text: str) -> float:

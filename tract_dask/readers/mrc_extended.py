@@ -63,9 +63,12 @@ def _metadata(values: dict[str, NDArray[np.float64]], where: str, *, whole: bool
     if not whole:
         return known
     days = values["Timestamp"]
+    started = float(days[0]) * 86400.0 if days[0] > 0 else None
     stamps = timed(days * 86400.0, where) if len(set(days.tolist())) > 1 else SourceMetadata()
     along = dict(stamps.along_frames)
     for name, tilt in (("stage_tilt", values["Alpha tilt"]), ("stage_tilt_beta", values["Beta tilt"])):
         if np.isfinite(tilt).any():
             along[name] = FrameValues(tilt, "deg")
-    return replace(known, frame_time_s=stamps.frame_time_s, notes=notes + stamps.notes, along_frames=along)
+    return replace(
+        known, frame_time_s=stamps.frame_time_s, notes=notes + stamps.notes, along_frames=along, started_s=started
+    )

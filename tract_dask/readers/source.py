@@ -67,6 +67,8 @@ class SourceMetadata:
         What each frame says of itself, by name: ``time`` (s, from the first frame on), ``temperature`` and others.
     references
         Files of the detector that lie beside the movie, by what they are: ``dark``, ``gain``, ``defects``.
+    started_s
+        When the first frame was taken, in seconds since a moment that is the same for all files of its kind.
     """
 
     pixel_size_pm: float | None = None
@@ -76,6 +78,7 @@ class SourceMetadata:
     notes: tuple[str, ...] = ()
     along_frames: Mapping[str, FrameValues] = field(default_factory=dict)
     references: Mapping[str, Path] = field(default_factory=dict)
+    started_s: float | None = None
 
 
 NOTHING_KNOWN = SourceMetadata()
