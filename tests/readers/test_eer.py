@@ -69,7 +69,7 @@ def test_what_is_not_eer_or_is_damaged(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no readouts of a camera"):
         open_source(path)
     pages = [(b"\x01\x02\x03", (3, 4), [short(258, 1), short(259, 65001), opaque(65001, b"<metadata/>")])]
-    with pytest.raises(SourceError, match="page 0 .* cannot be decoded"):
+    with pytest.raises(SourceError, match=r"page 0 .* cannot be decoded"):
         open_source(tiff(path, pages)).read(0, 1)
 
 

@@ -189,9 +189,7 @@ def test_serialems_sections_of_another_stack(tmp_path: Path) -> None:
     (tmp_path / "a.mdoc").write_text(SECTIONS + section(0, "12-Oct-18  16:40:34", 0))
     known = open_source(mrc(tmp_path / "a.mrc", WORDS, 6)).metadata
     assert known.along_frames == {}
-    assert known.notes == (
-        "a.mdoc describes 1 sections, the movie has 6; what it says of each is not used",
-    )
+    assert known.notes == ("a.mdoc describes 1 sections, the movie has 6; what it says of each is not used",)
 
 
 @pytest.mark.parametrize(

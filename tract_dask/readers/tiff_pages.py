@@ -157,7 +157,7 @@ def walk(path: Path) -> tuple[list[Page], Tags, int]:
         pages: list[Page] = []
         first_tags: Tags = {}
         seen = set()
-        read = 0
+        read = 8 if dialect.pointer == "I" else 16
         while following:
             if following in seen:
                 raise _damaged_chain(f"page {len(pages)} leads back to an earlier page", path)
@@ -217,8 +217,9 @@ def _directory(tiff: _Tiff, start: int, number: int) -> tuple[dict[int, tuple[in
         expected = start + count_bytes + n_bytes + pointer_bytes
         raise truncated(str(tiff.path), f"before the directory of page {number} (counted from 0)", expected, tiff.size)
     entries = {tag: (kind, count, raw) for tag, kind, count, raw in entry.iter_unpack(tail[:n_bytes])}
-    elsewhere = sum(n for kind, count, _ in entries.values() if (n := _n_bytes(kind, count)) <= tiff.size)
-    return entries, dialect.parse(dialect.pointer, tail[n_bytes:])[0], len(tail) + elsewhere
+    sizes = [_n_bytes(kind, count) for kind, count, _ in entries.values()]
+    elsewhere = sum(n for n in sizes if struct.calcsize(dialect.pointer) < n <= tiff.size)
+    return entries, dialect.parse(dialect.pointer, tail[n_bytes:])[0], count_bytes + len(tail) + elsewhere
 
 
 def _n_bytes(kind: int, count: int) -> int:
