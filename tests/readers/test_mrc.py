@@ -192,6 +192,24 @@ def test_serialems_sections_of_another_stack(tmp_path: Path) -> None:
     assert known.notes == ("a.mdoc describes 1 sections, the movie has 6; what it says of each is not used",)
 
 
+def test_references_that_were_not_applied(tmp_path: Path) -> None:
+    lines = "[FrameSet = 0]\nGainReference = D:\\Refs\\CountRef_a.dm4\nDefectFile = defects_a.txt\n"
+    (tmp_path / "a.mrc.mdoc").write_text(lines)
+    (tmp_path / "defects_a.txt").write_text("x")
+    known = open_source(mrc(tmp_path / "a.mrc", WORDS, 6)).metadata
+    assert known.references == {"defects": tmp_path / "defects_a.txt"}
+    assert "gain reference was not applied; it is CountRef_a.dm4, which is not there" in known.notes[0]
+    assert "defects reference was not applied; it is defects_a.txt, which lies beside it" in known.notes[1]
+
+
+def test_bytes_that_may_hold_two_pixels(tmp_path: Path) -> None:
+    path = tmp_path / "a.mrc"
+    mrc(path, COUNTS[:1], 0, nx=2880, ny=4092, nz=1, dmax=200)
+    with path.open("r+b") as file:
+        file.truncate(1024 + 2880 * 4092)
+    assert "may be those of a K3 with two pixels of 4 bits in a byte" in notes(path)
+
+
 @pytest.mark.parametrize(
     ("lines", "dose", "seconds", "note"),
     [

@@ -267,6 +267,13 @@ def test_imagejs_units(lines: dict[str, str], size: float, seconds: float, note:
     assert bool(notes(path)) == bool(note)
 
 
+def test_an_orientation_is_noted(tmp_path: Path) -> None:
+    page = (COUNTS[0].tobytes(), (20, 24), [short(258, 8), short(274, 4)])
+    path = tiff(tmp_path / "a.tif", [page])
+    np.testing.assert_array_equal(open_source(path).read(0, 1)[0], COUNTS[0])
+    assert "turned or mirrored (orientation 4); it is read as it is stored" in notes(path)
+
+
 def test_serialems_file_beside_a_tiff(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", WORDS, metadata=None, photometric="minisblack")
     (tmp_path / "a.tif.mdoc").write_text("[FrameSet = 0]\nPixelSpacing = 0.5\nExposureTime = 3\nNumSubFrames = 6\n")

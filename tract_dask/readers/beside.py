@@ -26,7 +26,7 @@ def known_beside(path: Path, n_frames: int, permit: Permit | None) -> SourceMeta
     known = NOTHING_KNOWN
     for file in _mdoc_names(path):
         if file.is_file():
-            known = merged(known, mdoc.parse(_text(file, permit), n_frames, file.name), file.name)
+            known = _found(mdoc.parse(_text(file, permit), n_frames, file.name), path)
             break
     for file in _info_names(path):
         if file.is_file():
@@ -66,6 +66,18 @@ def merged(first: SourceMetadata, second: SourceMetadata, where: str) -> SourceM
         references={**second.references, **first.references},
         started_s=second.started_s if first.started_s is None else first.started_s,
     )
+
+
+def _found(known: SourceMetadata, path: Path) -> SourceMetadata:
+    """Return what is known with the references that lie beside the movie, and a note on each that frames lack."""
+    there = {kind: path.with_name(name.name) for kind, name in known.references.items()}
+    notes = tuple(
+        f"{path.name}: the camera's {kind} reference was not applied; it is {file.name},"
+        f" which {'lies beside it' if file.is_file() else 'is not there'}"
+        for kind, file in there.items()
+    )
+    found = {kind: file for kind, file in there.items() if file.is_file()}
+    return replace(known, references=found, notes=(*known.notes, *notes))
 
 
 def _mdoc_names(path: Path) -> tuple[Path, ...]:

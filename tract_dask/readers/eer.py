@@ -66,7 +66,7 @@ class EerSource(Source):
 _PADDING = bytes(4)
 
 
-def _decoded(tiff: tifffile.TiffFile, directory: int, number: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _decoded(tiff: tifffile.TiffFile, directory: int, number: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Return where a readout has electrons (y, x).
 
     Its one strip holds runs of empty pixels, each followed by an event's place within its pixel, least bit first; a run
@@ -75,9 +75,9 @@ def _decoded(tiff: tifffile.TiffFile, directory: int, number: int, shape: tuple[
     """
     tiff.filehandle.seek(directory)
     page = tifffile.TiffPage(tiff, index=number)
-    bits = (8 if page.compression == _CODECS[0] else 7, 2, 2)
+    bits = [8 if page.compression == _CODECS[0] else 7, 2, 2]
     if page.compression == _CODECS[2]:
-        bits = tuple(int(page.tags.valueof(tag, usual)) for tag, usual in zip(_BITS, bits, strict=True))
+        bits = [int(page.tags.valueof(tag, usual)) for tag, usual in zip(_BITS, bits, strict=True)]
     if len(page.dataoffsets) != 1:
         raise ValueError(f"{len(page.dataoffsets)} strips, where a readout has one")
     tiff.filehandle.seek(page.dataoffsets[0])

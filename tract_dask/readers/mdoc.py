@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 
@@ -34,7 +35,8 @@ def parse(text: str, n_frames: int, where: str) -> SourceMetadata:
     about, sections, frame_set = _sections(text)
     known = _of_all(about | (frame_set or next(iter(sections), {})), where)
     if frame_set is not None:
-        return _joined(known, _of_frame_set(about | frame_set, n_frames, where))
+        known = _joined(known, _of_frame_set(about | frame_set, n_frames, where))
+        return replace(known, references=_references(about | frame_set))
     if not sections:
         return known
     if len(sections) != n_frames:
@@ -89,6 +91,12 @@ def _of_frame_set(fields: Fields, n_frames: int, where: str) -> SourceMetadata:
         seconds = float(f"{exposure / n_frames:.9g}")
     dose, more = _dose(fields.get("FrameDosesAndNumber", ""), n_frames, where)
     return SourceMetadata(frame_time_s=seconds, dose=dose, notes=notes + more, started_s=_started(fields))
+
+
+def _references(fields: Fields) -> dict[str, Path]:
+    """Return the names of the detector's references; SerialEM names them where frames were saved without them."""
+    names = {"gain": fields.get("GainReference", ""), "defects": fields.get("DefectFile", "")}
+    return {kind: Path(re.split(r"[\\/]", name)[-1]) for kind, name in names.items() if name}
 
 
 def _dose(text: str, n_frames: int, where: str) -> tuple[float | None, tuple[str, ...]]:

@@ -21,6 +21,7 @@ from .source import (
     SourceMetadata,
     checked_dtype,
     checked_shape,
+    maybe_packed,
     truncated,
     unaccounted,
     untested,
@@ -76,6 +77,7 @@ def open_mrc(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     frame_bytes = int(header["ny"]) * row_bytes
     offset = _HEADER_BYTES + max(0, int(header["nsymbt"]))
     n_frames, notes = _count(header, path, offset, frame_bytes)
+    half = () if pixels.packed else maybe_packed(pixels.stored, (int(header["ny"]), pixels.columns), path.name)
     shape = checked_shape((n_frames, int(header["ny"]), pixels.columns), str(path))
     return (NibbleSource if pixels.packed else BlockSource)(
         path=str(path),
@@ -83,7 +85,7 @@ def open_mrc(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
         format="MRC",
         shape=shape,
         dtype=checked_dtype(pixels.stored, str(path)),
-        metadata=_metadata(header, path, n_frames, (*pixels.notes, *notes), permit),
+        metadata=_metadata(header, path, n_frames, (*pixels.notes, *half, *notes), permit),
         offsets=offset + frame_bytes * np.arange(n_frames, dtype=np.int64),
         stored=pixels.stored,
     )

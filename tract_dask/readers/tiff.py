@@ -22,6 +22,7 @@ from .source import (
     checked_claim,
     checked_dtype,
     checked_shape,
+    maybe_packed,
     truncated,
     unaccounted,
     widened,
@@ -29,7 +30,7 @@ from .source import (
 )
 from .tiff_codecs import CODECS, PART_BYTES, check_codestreams
 from .tiff_metadata import Description, parse_description
-from .tiff_pages import SUB_PAGES, Page, walk
+from .tiff_pages import ORIENTATION, SUB_PAGES, Page, Tags, walk
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it warns of is an error here, with a remedy
 
@@ -76,7 +77,8 @@ def decoded(tiff: tifffile.TiffFile, directory: int, number: int, shape: tuple[i
     tiff.filehandle.seek(directory)
     page = tifffile.TiffPage(tiff, index=number)
     check_codestreams(tiff.filehandle, page, tiff.filehandle.path)
-    return page.asarray(maxworkers=1).reshape(shape)
+    frame: Frames = page.asarray(maxworkers=1).reshape(shape)
+    return frame
 
 
 def undecoded(number: int, where: str, error: Exception) -> SourceError:
@@ -114,6 +116,7 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit |
     offsets = _offsets(pages, n_frames, description, path)
     dtype, flipped, notes = _meaning(pages[0], description, path)
     stored_bytes += (n_frames - len(pages)) * pages[0].n_stored if n_frames > len(pages) else 0
+    notes += _turned(tags, path) + maybe_packed(dtype, pages[0].shape, path.name)
     notes += () if SUB_PAGES in tags else unaccounted(path.name, path.stat().st_size - stored_bytes, pages[0].n_stored)
     metadata = replace(description.metadata, notes=(*description.metadata.notes, *notes))
     common: dict[str, Any] = {
@@ -166,6 +169,13 @@ def _meaning(page: Page, description: Description, path: Path) -> tuple[np.dtype
         return dtype, 0, (f"{where} is shown with white for 0 (MinIsWhite); its numbers are read as stored",)
     n_bits = 8 * dtype.itemsize if dtype.kind == "i" else page.n_bits
     return dtype, (1 << n_bits) - 1, (f"{where} stores white as 0 (MinIsWhite); its numbers are turned over",)
+
+
+def _turned(tags: Tags, path: Path) -> tuple[str, ...]:
+    orientation = (tags.get(ORIENTATION) or (1,))[0]
+    if not 2 <= orientation <= 8:
+        return ()
+    return (f"{path.name} is to be shown turned or mirrored (orientation {orientation}); it is read as it is stored",)
 
 
 def _check_claims(pages: list[Page], path: Path) -> None:
