@@ -216,6 +216,14 @@ def test_pages_that_a_description_does_not_count(tmp_path: Path) -> None:
     assert "has 6 pages, its description names 4; the others are not read" in notes(path)
 
 
+@pytest.mark.parametrize("counted", [6, 4, 9])
+def test_pages_that_a_shape_does_not_count(counted: int, tmp_path: Path) -> None:
+    about = json.dumps({"axes": "TYX", "shape": [counted, 20, 24]})
+    tifffile.imwrite(tmp_path / "a.tif", WORDS, description=about, metadata=None, photometric="minisblack")
+    assert open_source(tmp_path / "a.tif").shape[0] == 6
+    assert ("has 6 pages, its description counts" in notes(tmp_path / "a.tif")) == (counted != 6)
+
+
 def ome(path: Path, frames: np.ndarray, pixels: str, inside: str = "") -> Path:
     sizes = "".join(f'{name}="{value}" ' for name, value in (("SizeC", 1), ("SizeZ", 1)))
     times = "" if "SizeT" in pixels else f'SizeT="{len(frames)}"'

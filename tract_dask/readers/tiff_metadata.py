@@ -76,7 +76,7 @@ def parse_description(tags: Tags, path: Path, pages: list[Page]) -> Description:
     if text.endswith("OME>"):
         return _ome(text, path, len(pages))
     if text.startswith("{") and '"shape"' in text:
-        return _shaped(text, tags, path)
+        return _shaped(text, tags, path, len(pages))
     if tags.get(STK_PLANES):
         n_planes, metadata = of_stk(tags, path)
         return Description("MetaMorph STK", n_planes, True, metadata=metadata)
@@ -125,7 +125,7 @@ def _more_pages(n_frames: int, n_pages: int, path: Path) -> tuple[str, ...]:
     return (f"{path.name} has {n_pages} pages, its description counts {n_frames}; all are read",)
 
 
-def _shaped(text: str, tags: Tags, path: Path) -> Description:
+def _shaped(text: str, tags: Tags, path: Path, n_pages: int) -> Description:
     try:
         fields = json.loads(text)
         shape = [int(n) for n in fields["shape"][:-2] if n > 1]
@@ -134,8 +134,12 @@ def _shaped(text: str, tags: Tags, path: Path) -> Description:
     if len(shape) > 1:
         _one_axis(path, **{f"axis {k}": n for k, n in enumerate(shape)})
     unit = _RESOLUTION_UNITS.get(_first(tags, RESOLUTION_UNIT), "")
-    n_frames = math.prod(shape) if fields.get("truncated") else None
-    return Description("TIFF", n_frames, bool(fields.get("truncated")), metadata=_resolution(tags, unit))
+    n_frames = math.prod(shape)
+    if fields.get("truncated"):
+        return Description("TIFF", n_frames, True, metadata=_resolution(tags, unit))
+    known = _resolution(tags, unit)
+    notes = (f"{path.name} has {n_pages} pages, its description counts {n_frames}; the pages are read",)
+    return Description(metadata=known if n_frames == n_pages else replace(known, notes=known.notes + notes))
 
 
 def _ome(text: str, path: Path, n_pages: int) -> Description:
