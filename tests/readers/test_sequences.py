@@ -74,6 +74,17 @@ def test_decimals_of_any_length_are_in_order(numbers: list[float]) -> None:
     assert values == sorted(values)
 
 
+ODD = st.text(st.sampled_from("ab01.9,-+_ ()~٣²é") | st.characters(exclude_characters="/"), min_size=1, max_size=12)
+
+
+@given(st.lists(ODD.map(lambda stem: f"{stem}.tif"), min_size=1, max_size=8, unique=True))
+def test_any_names_have_an_order_and_notes(names: list[str]) -> None:
+    found = in_order(names)
+    assert sorted(found) == sorted(names)
+    assert all(isinstance(note, str) for note in notes_on(found) + gaps(found))
+    assert set(references(names)) < set(names)
+
+
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

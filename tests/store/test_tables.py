@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tract_dask.errors import InputError, SettingsError
 from tract_dask.export.atoms import read_atoms
@@ -72,6 +74,15 @@ def test_drift_and_numbers_of_atoms_with_decimal_commas(tmp_path: Path) -> None:
     path.write_text("column_id,atoms\n4.5,3\n")
     with pytest.raises(InputError, match="line 2: column_id cannot be read"):
         read_atoms(path)
+
+
+@given(st.text(st.sampled_from('xy,;\t\n\r"#1.5 ='), max_size=40))
+def test_any_text_is_a_table_or_is_refused(text: str) -> None:
+    try:
+        table = parse_table(text, "a.csv")
+    except SettingsError:
+        return
+    assert all(len(values) == len(table.header) for _, values in table.rows)
 
 
 @pytest.mark.parametrize(("text", "value"), [("1e-3", 1e-3), (" -.5 ", -0.5), ("+2.", 2.0), ("Inf", np.inf)])
