@@ -46,6 +46,25 @@ def test_the_sign_of_bytes(fields: dict[str, float], dtype: str, note: str, tmp_
     assert bool(source.metadata.notes) == bool(note)
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("low", "high", "kind", "note"),
+    [
+        (0, 49800, "u2", "the numbers of mode 1 are read without a sign"),
+        (-32568, 17032, "i2", "may have been stored with 32768 taken off"),
+        (-5, 3000, "i2", ""),
+        (0, 0, "i2", ""),
+    ],
+)
+def test_the_sign_of_words(low: float, high: float, kind: str, note: str, order: str, tmp_path: Path) -> None:
+    frames = (COUNTS.astype("u2") * 200).astype(f"{order}u2")
+    source = open_source(mrc(tmp_path / "a.mrc", frames, 1, dmin=low, dmax=high, order=order))
+    assert source.dtype == np.dtype(kind)
+    np.testing.assert_array_equal(source.read(0, 6), frames.astype("u2").view(kind))
+    assert note in notes(tmp_path / "a.mrc")
+    assert bool(notes(tmp_path / "a.mrc")) == bool(note)
+
+
 @pytest.mark.parametrize("n_x", [24, 23, 1])
 def test_four_bits(n_x: int, tmp_path: Path) -> None:
     frames = np.random.default_rng(3).integers(0, 16, (5, 7, n_x))

@@ -135,10 +135,26 @@ def _pixels(header: Any, data: bytes, path: Path, permit: Permit | None) -> _Pix
         return _Pixels(np.dtype("u1"), columns if mode == 101 else 2 * columns, packed=True, notes=(note,))
     stored = np.dtype(_MODES[mode]).newbyteorder(order)
     checked_dtype(stored, str(path))
+    if mode == 1:
+        return _words(header, stored, columns, path)
     if mode:
         return _Pixels(stored, columns)
     signed, notes = _is_signed(header, flags if stamp == _IMOD_STAMP else None, path, permit)
     return _Pixels(np.dtype("i1" if signed else "u1"), columns, notes=notes)
+
+
+def _words(header: Any, stored: np.dtype[Any], columns: int, path: Path) -> _Pixels:
+    """Return how 16 bits of mode 1 are meant: with a sign, but some programs put numbers without one there."""
+    low, high = float(header["dmin"]), float(header["dmax"])
+    if 32767 < high <= 65535 and low >= 0:
+        note = f"{path.name}: its header goes up to {high:g}: the numbers of mode 1 are read without a sign"
+        return _Pixels(np.dtype("u2").newbyteorder(stored.byteorder), columns, notes=(note,))
+    if -32768 <= low < -16384 and low <= high:
+        note = (
+            f"{path.name}: its numbers go down to {low:g}; counts of 16 bits may have been stored with 32768 taken off"
+        )
+        return _Pixels(stored, columns, notes=(note,))
+    return _Pixels(stored, columns)
 
 
 def _is_signed(header: Any, flags: int | None, path: Path, permit: Permit | None) -> tuple[bool, tuple[str, ...]]:
