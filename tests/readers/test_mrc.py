@@ -137,7 +137,8 @@ def test_feis_extended_header(tmp_path: Path) -> None:
 def test_two_pixel_sizes_that_contradict_each_other(tmp_path: Path) -> None:
     extended = fei_records(6, Pixel_size_X=2e-11, Pixel_size_Y=2e-11)
     path = mrc(tmp_path / "a.mrc", WORDS, 6, extended=extended, exttyp=b"FEI2", cella=(48, 40, 1))
-    assert open_source(path).metadata.pixel_size_pm == 20.0
+    known = open_source(path).metadata
+    assert (known.pixel_size_pm, known.along_frames, len(known.notes)) == (20.0, {}, 1)
     assert "gives a pixel size of 200 pm, the movie 20 pm, which is used" in notes(path)
 
 

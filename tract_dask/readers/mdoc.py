@@ -116,7 +116,8 @@ def _dose(text: str, n_frames: int, where: str) -> tuple[float | None, tuple[str
 
 def _of_sections(sections: list[Fields], where: str) -> SourceMetadata:
     """Return times and tilts of sections."""
-    known = timed([_seconds(section.get("DateTime", "")) for section in sections], where)
+    stamps = np.array([_seconds(section.get("DateTime", "")) for section in sections], np.float64)
+    known = timed(np.round(stamps - stamps[0], 6), where)
     if not any("DateTime" in section for section in sections):
         known = SourceMetadata()
     tilts = np.array([number(section.get("TiltAngle")) for section in sections], np.float64)

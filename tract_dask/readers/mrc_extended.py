@@ -64,7 +64,8 @@ def _metadata(values: dict[str, NDArray[np.float64]], where: str, *, whole: bool
         return known
     days = values["Timestamp"]
     started = float(days[0]) * 86400.0 if days[0] > 0 else None
-    stamps = timed(days * 86400.0, where) if len(set(days.tolist())) > 1 else SourceMetadata()
+    seconds = np.round((days - days[0]) * 86400.0, 6)
+    stamps = timed(seconds, where) if np.isfinite(seconds).all() and seconds.any() else SourceMetadata()
     along = dict(stamps.along_frames)
     for name, tilt in (("stage_tilt", values["Alpha tilt"]), ("stage_tilt_beta", values["Beta tilt"])):
         if np.isfinite(tilt).any():

@@ -160,7 +160,8 @@ def _times(known: Sequence[SourceMetadata], lengths: Sequence[int], where: str) 
             return SourceMetadata()
         stamps.append(part.started_s + (within.values if within is not None else np.arange(length) * (step or 0.0)))
     every = np.concatenate(stamps)
-    return timed(every, f"{where} and the files after it") if np.ptp(every) else SourceMetadata()
+    since = np.round(every - every[0], 6)  # what float64 keeps of seconds since 1970
+    return timed(since, f"{where} and the files after it") if since.any() else SourceMetadata()
 
 
 def _values(name: str, known: Sequence[SourceMetadata], lengths: Sequence[int]) -> FrameValues:

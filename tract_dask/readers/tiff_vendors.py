@@ -24,8 +24,9 @@ def of_stk(tags: Tags, path: Path) -> tuple[int, SourceMetadata]:
     n_planes, place = tags[STK_PLANES]
     data = np.fromfile(path, "<u4", 6 * min(n_planes, path.stat().st_size // 24), offset=place)
     planes = data[: len(data) // 6 * 6].reshape(-1, 6).astype(np.float64)
-    stamps = planes[:, 2] * 86400.0 + planes[:, 3] / 1000.0  # days, and milliseconds of the day
-    known = timed(stamps, path.name) if len(set(stamps.tolist())) > 1 and len(planes) == n_planes else SourceMetadata()
+    since = planes - planes[:1]
+    stamps = since[:, 2] * 86400.0 + since[:, 3] / 1000.0  # days, and milliseconds of the day
+    known = timed(stamps, path.name) if stamps.any() and len(planes) == n_planes else SourceMetadata()
     pixel, notes = _stk_pixel(tags, path)
     return n_planes, SourceMetadata(
         pixel, known.frame_time_s, notes=notes + known.notes, along_frames=known.along_frames
