@@ -10,8 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from files_dm import document, image, numbered, thumbnail, write_dm, write_dm5, write_tags
 
-from tests.helpers.files_dm import document, image, numbered, thumbnail, write_dm, write_dm5, write_tags
 from tract_dask.errors import SourceError
 from tract_dask.readers import open_source
 from tract_dask.readers.dm_tags import read_tags
@@ -123,10 +123,10 @@ def test_a_thumbnail_that_no_tag_names_is_not_the_movie(tmp_path: Path) -> None:
     [
         ([(0.2, "Å"), (0.2, "Å"), (20.0, "µs")], 20, 2e-5, ""),
         ([(0.001, "µm"), (0.002, "µm"), (1.0, "")], 1000, None, "not square"),
-        ([(-0.1, "nm"), (0.1, "nm"), (2.0, "nm")], 100, None, "its frames are 2 nm apart, which is no frame time"),
-        ([(0.01, "1/nm"), (0.01, "1/nm"), (1.0, "sec")], None, 1, "calibrated in 1/nm, which is no length"),
+        ([(-0.1, "nm"), (0.1, "nm"), (2.0, "nm")], 100, None, "its frames are 2 nm apart, which is not a frame time"),
+        ([(0.01, "1/nm"), (0.01, "1/nm"), (1.0, "sec")], None, 1, "calibrated in 1/nm, which is not a length"),
         ([(0.1, "nm"), (1.0, "")], 100, None, "only one of x and y is calibrated"),
-        ([(0.0, "nm"), (0.0, "nm")], None, None, "a pixel of 0 nm makes no sense"),
+        ([(0.0, "nm"), (0.0, "nm")], None, None, "a pixel of 0 nm is impossible"),
         ([(1.0, "mrad"), (1.0, "mrad"), (0.0, "s")], None, None, "mrad"),
         ([(1e-9, "ms"), (1.0, "nm")], 1000, None, "calibrated in ms"),
     ],

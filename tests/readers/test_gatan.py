@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from files_dm import in_situ, write_director, write_dm, write_seconds
 
-from tests.helpers.files_dm import in_situ, write_director, write_dm, write_seconds
 from tract_dask.errors import SettingsError, SourceError
 from tract_dask.readers import files_named_now, is_movie_folder, open_source
 from tract_dask.settings import SourceSettings

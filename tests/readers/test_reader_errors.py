@@ -209,8 +209,8 @@ def test_cut_mrc_npy_and_hdf5(tmp_path: Path) -> None:
 
 
 def test_mrc_of_an_unknown_mode(tmp_path: Path) -> None:
-    (tmp_path / "movie.mrc").write_bytes(np.array([4, 4, 4, 101] + 252 * [0], "<i4").tobytes())
-    fails(tmp_path / "movie.mrc", "not that of an MRC stack", "mode [4, 4, 4, 101]")
+    (tmp_path / "movie.mrc").write_bytes(np.array([4, 4, 4, 99] + 252 * [0], "<i4").tobytes())
+    fails(tmp_path / "movie.mrc", "not that of an MRC stack", "mode [4, 4, 4, 99]")
 
 
 def test_no_frames(tmp_path: Path) -> None:

@@ -8,15 +8,17 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import files_classic
 import h5py
 import mrcfile
 import numpy as np
 import pytest
 import tifffile
+from files_classic import eer, fei_records, mrc_4bit, stk
+from files_dm import write_director, write_dm
 from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
-from tests.helpers.files_dm import write_director, write_dm
 from tract_dask.errors import TractError
 from tract_dask.readers import open_source
 from tract_dask.settings import SourceSettings
@@ -105,6 +107,11 @@ def hyperspy(path: Path) -> None:
             group.create_group(f"axis-{k}").attrs.update({"scale": 0.1, "units": unit})
 
 
+SIGNED = (
+    "ImageJ=1.54f\nimages=5\nframes=5\ncf=0\nc0=-32768.0\nc1=1.0\nvunit=gray\nunit=\\u00C5\nfinterval=25\ntunit=ms\n"
+)
+FEI = "[Scan]\r\nPixelWidth=3.3e-011\r\nPixelHeight=3.3e-011\r\n[Image]\r\nResolutionY=30\r\n"
+
 BASES: dict[str, Callable[[Path], object]] = {
     "tiled.tif": lambda path: tiff(path, bigtiff=True, tile=(16, 16), compression="zstd"),
     "lzw.tif": lambda path: tiff(path, compression="lzw", predictor=True, rowsperstrip=7, byteorder=">"),
@@ -122,6 +129,19 @@ BASES: dict[str, Callable[[Path], object]] = {
     "bytes.mrc": lambda path: mrc(path, "i1", 160),
     "half.mrc": lambda path: mrc(path, "f2"),
     "words.mrc": lambda path: mrc(path, "u2", 3072),
+    "nibbles.mrc": lambda path: mrc_4bit(path, FRAMES),
+    "fei.mrc": lambda path: files_classic.mrc(
+        path,
+        FRAMES,
+        6,
+        extended=fei_records(5, Timestamp=range(1, 6), Alpha_tilt=range(5), Pixel_size_X=1e-11, Pixel_size_Y=1e-11),
+        exttyp=b"FEI2",
+    ),
+    "movie.eer": lambda path: eer(path, FRAMES > 8, final=True),
+    "movie.stk": lambda path: stk(path, FRAMES, [1, 2, 3, 4, 6], (1, 20), "nm"),
+    "white.tif": lambda path: tiff(path, photometric="miniswhite"),
+    "signed.tif": lambda path: tiff(path, description=SIGNED, metadata=None),
+    "sem.tif": lambda path: tiff(path, metadata=None, extratags=[(34682, "s", 0, FEI, True)]),
     "one.npy": lambda path: npy(path, (1, 0), FRAMES.astype(">f8")),
     "two.npy": lambda path: npy(path, (2, 0), np.asfortranarray(FRAMES)),
     "three.npy": lambda path: npy(path, (3, 0), FRAMES > 5),

@@ -14,15 +14,20 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from files_classic import eer
+from files_dm import write_dm
 from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
-from tests.helpers.files_dm import write_dm
 from tract_dask.errors import InputError, SourceError
 from tract_dask.readers import READERS, open_cached, open_source
 from tract_dask.settings import SourceSettings
 
 FRAMES = np.random.default_rng(0).integers(0, 200, (4, 20, 24)).astype("u2")
+EVENTS = np.random.default_rng(2).random((160, 20, 24)) < 0.1
+FRAMES_OF = {".eer": EVENTS.reshape(4, 40, 20, 24).sum(1, dtype="u1")}
+"""What those formats give that cannot hold FRAMES."""
+
 DECLARED = SourceSettings(raw_shape=(0, 20, 24), raw_dtype="uint16")
 BESIDE = {".emi", ".hdr"}
 """Suffixes of files whose frames lie in another one."""
@@ -40,8 +45,10 @@ def fails(path: Path | str, *words: str) -> None:
 
 def write(path: Path) -> Path:
     suffix = path.suffix
-    if suffix in (".tif", ".tiff"):
+    if suffix in (".tif", ".tiff", ".stk"):
         tifffile.imwrite(path, FRAMES, photometric="minisblack", compression="zlib" if suffix == ".tiff" else None)
+    elif suffix == ".eer":
+        eer(path, EVENTS)
     elif suffix == ".npy":
         np.save(path, FRAMES)
     elif suffix in (".avi", ".mp4", ".mov"):
@@ -49,7 +56,7 @@ def write(path: Path) -> Path:
     elif suffix in (".h5", ".hdf5", ".hspy"):
         with h5py.File(path, "w") as file:
             file["data"] = FRAMES
-    elif suffix in (".mrc", ".mrcs", ".st"):
+    elif suffix in (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"):
         header = np.zeros(256, "<i4")
         header[:4] = *FRAMES.shape[::-1], 6
         path.write_bytes(header.tobytes() + FRAMES.tobytes())
@@ -128,11 +135,12 @@ def test_names_that_look_like_something_else(name: str, suffix: str, tmp_path: P
     folder.mkdir(parents=True)
     path = write(folder / f"{Path(name).name}{suffix}")
     write(tmp_path / f"stranger{suffix}")
+    frames = FRAMES_OF.get(suffix, FRAMES)
     for place in (path, folder, f"{folder}/*{suffix}"):
         source = open_source(place, DECLARED)
         assert source.files == (path,)
-        np.testing.assert_array_equal(source.read(0, 4), FRAMES)
-        np.testing.assert_array_equal(open_cached(str(place), DECLARED).read(1, 3), FRAMES[1:3])
+        np.testing.assert_array_equal(source.read(0, 4), frames)
+        np.testing.assert_array_equal(open_cached(str(place), DECLARED).read(1, 3), frames[1:3])
     if suffix in (".h5", ".hspy"):
         np.testing.assert_array_equal(open_source(f"{path}::/data").read(0, 4), FRAMES)
 

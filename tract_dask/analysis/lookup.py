@@ -23,11 +23,15 @@ from ..settings.run import ColumnSettings, FitSettings
 from ..stages.columns.find import find_columns
 from ..stages.columns.window_size import neighbour_distance, resolve_window
 from ..store.columns import column_dataset, positions
-from ..store.files import write_aside
+from ..store.files import read_small, write_aside
 from ..store.schema import REJECTED
+from ..store.tables import decoded, parse_number, parse_table
 from .intensity import UNIT
 
 _PM_PER_ANGSTROM = 100.0
+_MOST_BYTES = 64 << 20
+"""Bytes of a look-up table."""
+
 _REACH = 1 / 8
 """Share of the window by which a fit may be away from where its column is known to be."""
 
@@ -186,33 +190,32 @@ def intensity_bound(parameters: Floats, window_px: int, *, fixed_shape: bool) ->
 def _read_rows(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a table with numbers, NaN where a cell is empty."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file)
-            lines = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        text = decoded(read_small(path, _MOST_BYTES))
+    except (OSError, UnicodeDecodeError) as error:
         raise SettingsError("the look-up table cannot be read", str(path), "a CSV file", str(error)) from error
-    missing = {"atoms", "intensity"} - set(reader.fieldnames or ())
-    if missing or not lines:
+    table = parse_table(text, str(path))
+    if {"atoms", "intensity"} - set(table.header) or not table.rows:
         raise SettingsError(
             "this is not a look-up table",
             str(path),
             "columns atoms, intensity, optionally low, high, site, and one row or more",
-            f"columns {', '.join(reader.fieldnames or ())} and {len(lines)} rows",
+            f"columns {', '.join(table.header)} and {len(table.rows)} rows",
         )
     rows = []
-    for number, line in enumerate(lines, start=2):
-        row: dict[str, Any] = {"site": (line.get("site") or "").strip()}
+    for at, values in table.rows:
+        line = dict(zip(table.header, values, strict=True))
+        row: dict[str, Any] = {"site": line.get("site", "")}
         try:
-            row |= {name: float(line.get(name) or "nan") for name in ("atoms", *TABLE)}
+            row |= {name: parse_number(line.get(name) or "nan") for name in ("atoms", *TABLE)}
             usable = row["atoms"] == int(row["atoms"]) >= 1 and np.isfinite(row["intensity"])
         except ValueError:
             usable = False
         if not usable:
             raise SettingsError(
-                f"line {number} cannot be used",
+                f"line {at} cannot be used",
                 str(path),
                 "a whole number of atoms from 1 on, and numbers",
-                ", ".join(str(value) for value in line.values()),
+                ", ".join(values),
             )
         rows.append(row)
     return rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,15 @@ from numpy.typing import NDArray
 from ..analysis.motion import positions
 from ..errors import InputError, SettingsError
 from ..kernels.gaussian.intensity import Floats
+from ..store.files import read_small
+from ..store.tables import decoded, parse_number, parse_table
 from .tables import ROWS, written_aside
 
 ALIGNMENTS = ("centre", "face")
 
 _PM_PER_ANGSTROM = 100.0
+_MOST_BYTES = 1 << 30
+"""Bytes of a table of numbers of atoms."""
 
 
 def to_xyz(
@@ -168,9 +173,11 @@ def read_atoms(path: str | Path) -> xr.DataArray:
         Where it cannot be read, or lacks them.
     """
     try:
-        read = pd.read_csv(path)
-    except (OSError, ValueError) as error:
+        text = decoded(read_small(path, _MOST_BYTES))
+    except (OSError, UnicodeDecodeError) as error:
         raise InputError("the numbers of atoms cannot be read", str(path), "a CSV file", str(error)) from error
+    table = parse_table(text, str(path), InputError)
+    read = pd.DataFrame([_numbers(table.header, *row, str(path)) for row in table.rows], columns=table.header)
     index = [name for name in ("frame", "column_id") if name in read]
     if "column_id" not in read or "atoms" not in read or read.duplicated(index).any():
         raise InputError(
@@ -179,5 +186,28 @@ def read_atoms(path: str | Path) -> xr.DataArray:
             "columns column_id, atoms and perhaps frame, one row for each column (and frame)",
             ", ".join(map(str, read)),
         )
+    read = read.astype(dict.fromkeys(index, np.int64))
     found: xr.DataArray = read.set_index(index)["atoms"].to_xarray()
     return found
+
+
+def _numbers(header: list[str], line: int, values: list[str], where: str) -> list[float | str]:
+    """Return a row whose IDs, frames and numbers of atoms are numbers, the last NaN where there is none.
+
+    Raises
+    ------
+    InputError
+        Naming the line, where one is not.
+    """
+    row: list[float | str] = []
+    for name, value in zip(header, values, strict=True):
+        try:
+            found: float | str = parse_number(value or "nan") if name in ("frame", "column_id", "atoms") else value
+        except ValueError:
+            found = math.inf
+        if name in ("frame", "column_id") and not float(found).is_integer():
+            found = math.inf
+        if found == math.inf:
+            raise InputError(f"{name} cannot be read", f"{where}, line {line}", "a whole number", repr(value))
+        row.append(found)
+    return row

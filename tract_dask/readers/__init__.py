@@ -19,6 +19,7 @@ from pathlib import Path
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
 from . import gatan, video
+from .eer import open_eer
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
 from .merlin import is_header_of_mib, open_merlin
@@ -49,8 +50,9 @@ __all__ = [
 ]
 
 BUILT_IN = (
-    Reader("TIFF", (".tif", ".tiff"), open_tiff),
-    Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc, is_part=belongs_to_seq),
+    Reader("TIFF", (".tif", ".tiff", ".stk"), open_tiff),
+    Reader("EER", (".eer",), open_eer, inside="how many readouts are summed into a frame"),
+    Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc, is_part=belongs_to_seq),
     Reader("NumPy", (".npy",), open_npy),
     Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
     Reader("video", video.SUFFIXES, video.open_video),
@@ -87,8 +89,6 @@ READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
 
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()
-
-_NOT_APPLIED = "{} next to the movie is the {} reference of its detector, by its name; it is not applied to the frames"
 
 _RAW = READERS[".raw"]
 
@@ -140,10 +140,19 @@ def open_source(
         frame_time_s=known.frame_time_s if metadata.frame_time_s is None else metadata.frame_time_s,
         dose=known.dose if metadata.dose is None else metadata.dose,
         gain=metadata.gain,
-        notes=known.notes + tuple(_NOT_APPLIED.format(file.name, kind) for kind, file in known.references.items()),
+        notes=known.notes + _not_applied(known),
     )
     listed = tuple(place) if isinstance(place, list) else ()
     return select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
+
+
+def _not_applied(known: SourceMetadata) -> tuple[str, ...]:
+    """Return notes on the references of the detector that no note names yet."""
+    return tuple(
+        f"{file.name} next to the movie is the detector's {kind} reference, by its name; it is not applied to the frames"
+        for kind, file in known.references.items()
+        if kind != "metadata" and not any(file.name in note for note in known.notes)
+    )
 
 
 def open_cached(
@@ -183,7 +192,9 @@ def _open(path: str | FileList, settings: SourceSettings, permit: Permit | None)
     if not isinstance(path, FileList) and (reader := _reader_of_folder(Path(outer))):
         return _opened(reader, Path(outer), inner, settings, permit)
     listed = path if isinstance(path, FileList) else list_files(name, Path(outer), READERS)
-    return open_file(Path(outer)) if listed is None else open_sequence(name, list(listed.files), open_file)
+    if listed is None:
+        return open_file(Path(outer))
+    return open_sequence(name, list(listed.files), open_file, references=listed.references)
 
 
 def is_movie_folder(place: Path) -> bool:
@@ -226,7 +237,7 @@ def _open_list(names: list[str], settings: SourceSettings, permit: Permit | None
             "Name the same data set in each of them",
         )
     open_file = partial(_open_file, inner=next(iter(inside), ""), settings=settings, permit=permit)
-    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file)
+    return open_sequence(names[0] if names else "", [Path(outer) for outer, _ in split], open_file, listed=True)
 
 
 def _split(name: str) -> tuple[str, str]:

@@ -38,11 +38,15 @@ class BlockSource(Source):
         Pixel type as stored, with its byte order.
     firsts
         Position of the first byte of each file; a frame may cross from one into the next.
+    flipped
+        Bits that are the other way round than meant: all of them where white is 0, the highest where an offset makes
+        signed numbers positive.
     """
 
     offsets: NDArray[np.int64]
     stored: np.dtype[Any]
     firsts: tuple[int, ...] = (0,)
+    flipped: int = 0
 
     @property
     def one_by_one(self) -> bool:
@@ -70,10 +74,11 @@ class BlockSource(Source):
         self._check_exact(start, frames)
 
     def _fill(self, start: int, frames: Frames) -> None:
-        if self.stored.newbyteorder("=") == self.dtype:
+        if self.stored.newbyteorder("=") == self.dtype or self.flipped:
             self._fill_as_stored(start, frames)
-            if self.stored != self.dtype:
+            if self.stored.newbyteorder("=") != self.stored:
                 frames.byteswap(inplace=True)
+            flip(frames, self.flipped)
             return
         as_stored = np.empty((1, *self.shape[1:]), self.stored)
         for k in range(len(frames)):
@@ -97,6 +102,13 @@ class BlockSource(Source):
                     part = rest[: until - at]
                     fill_from(opened[number], at - self.firsts[number], part, self.files[number])
                     at, rest = at + len(part), rest[len(part) :]
+
+
+def flip(frames: Frames, bits: int) -> None:
+    """Turn these bits of each pixel, in place; whole numbers only."""
+    if bits:
+        pixels = frames.view(f"u{frames.itemsize}")
+        pixels ^= pixels.dtype.type(bits)
 
 
 def open_block(

@@ -20,8 +20,9 @@ from .dm import Document, image_of, open_image, read_document
 from .dm_calibration import calibration
 from .dm_image import Image
 from .dm_tags import number
+from .naming import in_order
 from .raw import open_raw
-from .sequence import natural_key, open_sequence
+from .sequence import open_sequence
 from .source import Permit, Source, SourceMetadata, checked_file, reading, untested
 from .times import timed
 
@@ -232,9 +233,11 @@ def _below(folder: Path, began: float, level: int, permit: Permit | None) -> Ite
 
 def _open_seconds(folder: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
     """Open the frames in folders by hour, minute and second, in the order of time."""
-    found = sorted(_below(folder, 0.0, 0, permit), key=lambda item: (item[0], natural_key(item[1].name)))
+    below = list(_below(folder, 0.0, 0, permit))
+    rank = {name: number for number, name in enumerate(in_order([file.name for _, file in below]))}
+    found = sorted(below, key=lambda item: (item[0], rank[item[1].name]))
     open_file = partial(_open_frame, inner=inner, settings=settings, permit=permit)
-    source = open_sequence(str(folder), [file for _, file in found], open_file)
+    source = open_sequence(str(folder), [file for _, file in found], open_file, listed=True)
     known = replace(source.metadata, notes=(untested("Gatan in-situ folders", str(folder)), *source.metadata.notes))
     source = replace(source, metadata=known)
     if "time" in known.along_frames or source.shape[0] != len(found):

@@ -6,12 +6,12 @@ import fnmatch
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import SourceError
+from .naming import in_order, references
 from .registry import Reader
-from .sequence import natural_key
 
 WILD = "*?["
 """Signs that make the last part of a path a pattern, unless there is a file or folder of this very name."""
@@ -28,10 +28,13 @@ class FileList:
         opens as the same files, unless they have changed meanwhile.
     files
         In the order of the numbers in their names.
+    references
+        Those that by their names are references of the detector, by what they are; one of each kind.
     """
 
     name: str
     files: tuple[Path, ...]
+    references: Mapping[str, Path] = field(default_factory=dict, compare=False)
 
     def __str__(self) -> str:
         return self.name
@@ -63,7 +66,11 @@ def list_files(name: str, outer: Path, readers: Mapping[str, Reader]) -> FileLis
     else:
         _check_folder(outer)
         return None
-    return FileList(name, tuple(sorted(found, key=lambda file: natural_key(file.name))))
+    folder = outer if outer.is_dir() else outer.parent
+    names = [file.name for file in found]
+    apart = references(names)
+    files = tuple(folder / name for name in in_order([name for name in names if name not in apart]))
+    return FileList(name, files, {kind: folder / name for name, kind in sorted(apart.items(), reverse=True)})
 
 
 def is_pattern(place: Path) -> bool:
@@ -94,7 +101,8 @@ def _readable(folder: Path, readers: Mapping[str, Reader]) -> list[Path]:
     """Return the files of the one readable format in a folder, without those that only belong to another one."""
     there = [file for file in folder.iterdir() if file.suffix.lower() in readers and not file.name.startswith(".")]
     files = [file for file in there if not _is_part(file, readers)]
-    kinds = Counter(file.suffix.lower() for file in files)
+    apart = references([file.name for file in files])
+    kinds = Counter(file.suffix.lower() for file in files if file.name not in apart)
     if len({readers[kind] for kind in kinds}) > 1:
         raise SourceError(
             "the folder holds files of several formats",

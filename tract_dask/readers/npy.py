@@ -14,7 +14,17 @@ import numpy as np
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import open_block
-from .source import Frames, Permit, Source, SourceMetadata, checked_dtype, checked_shape, truncated, widened
+from .source import (
+    Frames,
+    Permit,
+    Source,
+    SourceMetadata,
+    checked_dtype,
+    checked_shape,
+    truncated,
+    unaccounted,
+    widened,
+)
 
 _HEADER_BYTES = 10_000
 """NumPy, too, parses no longer header."""
@@ -62,7 +72,11 @@ def open_npy(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
             got=str(error) or type(error).__name__,
             remedy="Save it again with numpy.save",
         ) from error
-    source = open_block(path, name="NumPy", shape=shape, stored=stored, offset=offset)
+    n_bytes = math.prod(shape) * stored.itemsize
+    frame_bytes = math.prod(shape[-2:]) * stored.itemsize
+    notes = unaccounted(path.name, path.stat().st_size - offset - n_bytes, frame_bytes)
+    known = SourceMetadata(notes=notes)
+    source = open_block(path, name="NumPy", shape=shape, stored=stored, offset=offset, metadata=known)
     if not fortran:
         return source
     return FortranSource(
@@ -71,11 +85,11 @@ def open_npy(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
         format="NumPy",
         shape=checked_shape(shape, str(path)),
         dtype=checked_dtype(stored, str(path)),
-        metadata=SourceMetadata(),
+        metadata=known,
         axes=tuple(shape),
         stored=stored,
         offset=offset,
-        n_bytes=offset + math.prod(shape) * stored.itemsize,
+        n_bytes=offset + n_bytes,
     )
 
 

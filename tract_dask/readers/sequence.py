@@ -1,11 +1,10 @@
-"""Many files, one movie: a folder or a pattern, in the order of the numbers in their names."""
+"""Many files, one movie: a folder or a pattern, in the order of the numbers in their names, or a list."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingSourceError, SourceError
+from .naming import gaps, notes_on
 from .source import Frames, FrameValues, Source, SourceMetadata
 from .times import timed
 
@@ -59,8 +59,30 @@ class SequenceSource(Source):
         return frames
 
 
-def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Source]) -> SequenceSource:
-    """Open files as one movie, in their order; ``open_file`` opens one of them. A gap in their numbers becomes a note.
+def open_sequence(
+    path: str,
+    files: list[Path],
+    open_file: Callable[[Path], Source],
+    *,
+    listed: bool = False,
+    references: Mapping[str, Path] | None = None,
+) -> SequenceSource:
+    """Open files as one movie, in their order.
+
+    What is odd about their names, or differs between them, becomes a note.
+
+    Parameters
+    ----------
+    path
+        What the user named.
+    files
+        The files.
+    open_file
+        Opens one of them.
+    listed
+        The user listed the files, so that their names matter less.
+    references
+        Files of the folder that are references of the detector, by what they are.
 
     Raises
     ------
@@ -72,21 +94,26 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
             "the movie has no frames", path, "at least one file to read", "none", "Check the folder or the pattern"
         )
     first = open_file(files[0])
-    parts, behind = [first], dict.fromkeys(first.files)
+    lengths, behind, known = [first.shape[0]], dict.fromkeys(first.files), [first.metadata]
     for file in files[1:]:
         part = open_file(file)
         _check_alike(part, first.shape, first.dtype, files[0].name)
-        parts.append(part)
+        lengths.append(part.shape[0])
+        known.append(part.metadata)
         behind.update(dict.fromkeys(part.files))
-    firsts = np.cumsum([0, *(part.shape[0] for part in parts)])
-    metadata = _joined(parts, path)
+    firsts = np.cumsum([0, *lengths])
+    names = [file.name for file in files]
+    notes = (gaps if listed else notes_on)(names) + _left_out(references or {})
+    metadata = _joined(known, lengths, names)
     return SequenceSource(
         path=path,
         files=tuple(behind),
         format=f"sequence of {first.format}",
         shape=(int(firsts[-1]), *first.shape[1:]),
         dtype=first.dtype,
-        metadata=replace(metadata, notes=metadata.notes + gaps([file.name for file in files])),
+        metadata=replace(
+            metadata, notes=metadata.notes + notes, references={**metadata.references, **(references or {})}
+        ),
         parts=tuple(files),
         firsts=firsts,
         inside=first.inside,
@@ -94,38 +121,103 @@ def open_sequence(path: str, files: list[Path], open_file: Callable[[Path], Sour
     )
 
 
-def _joined(parts: list[Source], where: str) -> SourceMetadata:
-    """Return what the first file says, and along the frames what all of them say; times by their moments."""
-    first = parts[0].metadata
-    if len(parts) == 1:
-        return first
-    names = set.intersection(*(set(part.metadata.along_frames) for part in parts)) - {"time"}
-    along = {
-        name: FrameValues(
-            np.concatenate([part.metadata.along_frames[name].values for part in parts]), first.along_frames[name].units
-        )
-        for name in sorted(names)
-    }
-    stamps = np.concatenate([_stamps(part) for part in parts])
-    if not np.isfinite(stamps).all() or (stamps == stamps[0]).all():
-        return replace(first, along_frames=along)
-    times = timed(np.round(stamps - stamps[0], 6), where)
+def _left_out(references: Mapping[str, Path]) -> tuple[str, ...]:
+    if not references:
+        return ()
+    named = ", ".join(f"{file.name} ({kind})" for kind, file in references.items())
+    return (f"by their names these files are references of the detector, not frames, and were left out: {named}",)
+
+
+def _joined(known: Sequence[SourceMetadata], lengths: Sequence[int], names: Sequence[str]) -> SourceMetadata:
+    """Return what the files say together: what the first one says, the times and values of all, and what differs."""
+    if len(known) == 1:
+        return known[0]
+    first = known[0]
+    times = _times(known, lengths, names[0])
+    along = {name: _values(name, known, lengths) for name in first.along_frames if name != "time"}
+    if _say_time(known, lengths) and not times.along_frames:
+        note = f"each file has the times of its frames, but not when it began: the times of {names[0]} on are not known"
+        times = replace(times, notes=(*times.notes, note))
     return replace(
         first,
         frame_time_s=times.frame_time_s or first.frame_time_s,
-        notes=first.notes + times.notes,
-        along_frames=along | dict(times.along_frames),
+        notes=_notes(known, names) + _changes(known, names) + times.notes,
+        along_frames={**along, **times.along_frames},
     )
 
 
-def _stamps(part: Source) -> NDArray[np.float64]:
-    """Return the moments of a file's frames in seconds since 1970; NaN where the file does not say."""
-    known = part.metadata
-    began = np.nan if known.start_s is None else known.start_s
-    if "time" in known.along_frames:
-        return began + known.along_frames["time"].values
-    step = np.nan if known.frame_time_s is None else known.frame_time_s
-    return np.array([began + (number * step if number else 0.0) for number in range(part.shape[0])])
+def _say_time(known: Sequence[SourceMetadata], lengths: Sequence[int]) -> bool:
+    return any("time" in part.along_frames for part in known) and max(lengths) > 1
+
+
+def _times(known: Sequence[SourceMetadata], lengths: Sequence[int], where: str) -> SourceMetadata:
+    """Return the times of all frames where every file says when it began, and when its frames were taken after that."""
+    stamps = []
+    for part, length in zip(known, lengths, strict=True):
+        within = part.along_frames.get("time")
+        step = part.frame_time_s if length > 1 else 0.0
+        if part.start_s is None or (within is None and step is None):
+            return SourceMetadata()
+        stamps.append(part.start_s + (within.values if within is not None else np.arange(length) * (step or 0.0)))
+    every = np.concatenate(stamps)
+    since = np.round(every - every[0], 6)  # what float64 keeps of seconds since 1970
+    return timed(since, f"{where} and the files after it") if since.any() else SourceMetadata()
+
+
+def _values(name: str, known: Sequence[SourceMetadata], lengths: Sequence[int]) -> FrameValues:
+    """Return the values of all files' frames; NaN where a file does not have them in the units of the first."""
+    units = known[0].along_frames[name].units
+    parts = [part.along_frames.get(name) for part in known]
+    return FrameValues(
+        np.concatenate(
+            [
+                part.values if part is not None and part.units == units else np.full(length, np.nan)
+                for part, length in zip(parts, lengths, strict=True)
+            ]
+        ),
+        units,
+    )
+
+
+_MOST_NOTES = 8
+"""So many notes of files are kept."""
+
+
+def _notes(known: Sequence[SourceMetadata], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the notes of all files, each kind once, with the number of other files that it holds for, too."""
+    kinds: dict[str, list[str]] = {}
+    for part, name in zip(known, names, strict=True):
+        for note in part.notes:
+            kinds.setdefault(note.replace(name, "*"), []).append(note)
+    shown = [
+        f"{notes[0]} (and so of {len(notes) - 1} more files)" if len(notes) > 1 and "*" in kind else notes[0]
+        for kind, notes in kinds.items()
+    ]
+    more = (f"and {len(shown) - _MOST_NOTES} more notes on single files",) if len(shown) > _MOST_NOTES else ()
+    return (*shown[:_MOST_NOTES], *more)
+
+
+def _changes(known: Sequence[SourceMetadata], names: Sequence[str]) -> tuple[str, ...]:
+    """Return notes on calibrations that are not those of the first file."""
+    notes = []
+    for field, words, unit in (
+        ("pixel_size_pm", "pixel size", "pm"),
+        ("frame_time_s", "frame time", "s"),
+        ("dose", "dose", "e/A^2"),
+    ):
+        values = [getattr(part, field) for part in known]
+        others = [k for k, value in enumerate(values) if not _alike(value, values[0])]
+        if others:
+            here, there = (f"{value:.6g} {unit}" if value else "unknown" for value in (values[0], values[others[0]]))
+            more = f" (and {len(others) - 1} more files)" if len(others) > 1 else ""
+            notes.append(
+                f"the {words} is {here} in {names[0]}, and {there} in {names[others[0]]}{more}; the first is used"
+            )
+    return tuple(notes)
+
+
+def _alike(one: float | None, other: float | None) -> bool:
+    return one is other or (one is not None and other is not None and math.isclose(one, other, rel_tol=0.001))
 
 
 def _check_alike(part: Source, shape: tuple[int, int, int], dtype: np.dtype[Any], first: str) -> None:
@@ -137,40 +229,3 @@ def _check_alike(part: Source, shape: tuple[int, int, int], dtype: np.dtype[Any]
             f"{part.shape[1]} x {part.shape[2]} {part.dtype}",
             "Take it out of the folder, or choose the frames by a pattern",
         )
-
-
-def natural_key(name: str) -> tuple[tuple[int, str], ...]:
-    """Return a key that sorts names by their numbers.
-
-    Examples
-    --------
-    >>> sorted(["frame_10.tif", "frame_2.tif"], key=natural_key)
-    ['frame_2.tif', 'frame_10.tif']
-    """
-    return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name))
-
-
-def gaps(names: list[str]) -> tuple[str, ...]:
-    """Return a note on the numbers that are missing from a sorted sequence of names; none where they do not count up.
-
-    Examples
-    --------
-    >>> gaps(["f_001.tif", "f_002.tif", "f_005.tif"])
-    ('the sequence has a gap in its numbers: f_005.tif follows f_002.tif; the frames are read without one for the gap',)
-    """
-    if len({re.sub(r"\d+", "#", name) for name in names}) > 1:
-        return ()
-    fields = list(zip(*(map(int, re.findall(r"\d+", name)) for name in names), strict=True))
-    varying = [field for field in fields if len(set(field)) > 1]
-    if len(varying) != 1:
-        return ()
-    steps = [after - before for before, after in pairwise(varying[0])]
-    usual = min((step for step in steps if step > 0), default=0)
-    wide = [number for number, step in enumerate(steps) if step > usual > 0]
-    if not wide:
-        return ()
-    more = f" (and {len(wide) - 1} more)" if len(wide) > 1 else ""
-    return (
-        f"the sequence has a gap in its numbers: {names[wide[0] + 1]} follows {names[wide[0]]}{more};"
-        " the frames are read without one for the gap",
-    )

@@ -441,6 +441,31 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
+def unaccounted(where: str, n_bytes: int, frame_bytes: int, least: int | None = None) -> tuple[str, ...]:
+    """Return a note where a file holds bytes, ``least`` or a frame of them, that its header does not account for."""
+    if n_bytes < max(1, frame_bytes if least is None else least):
+        return ()
+    return (
+        f"{where} holds {n_bytes:,} bytes, as many as {n_bytes / max(1, frame_bytes):.3g} frames, that its header does"
+        " not account for; they are not read",
+    )
+
+
+_HALVES = {(7420, 3838): "K2", (3838, 7420): "K2", (4092, 2880): "K3", (8184, 5760): "K3"}
+"""Rows and columns of frames of whose columns there are half as many as the camera has."""
+
+
+def maybe_packed(dtype: np.dtype[Any], shape: tuple[int, ...], where: str) -> tuple[str, ...]:
+    """Return a note on bytes that by a frame's size (y, x) hold two pixels of 4 bits each, which no header says."""
+    camera = _HALVES.get((shape[0], shape[1])) if dtype.itemsize == 1 else None
+    if camera is None:
+        return ()
+    return (
+        f"{where}: frames of {shape[0]} x {shape[1]} bytes may be those of a {camera} with two pixels of 4 bits in a"
+        " byte; they are read as one pixel a byte",
+    )
+
+
 def untested(name: str, where: str) -> str:
     """Return the note for a format that was never tested with a camera's file."""
     return (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +13,45 @@ from numpy.typing import NDArray
 
 from ..errors import SourceError
 from ..settings.run import SourceSettings
-from .blocks import BlockSource
-from .source import Frames, Permit, Source, checked_claim, checked_dtype, checked_shape, truncated, widened, words
+from .beside import known_beside, merged
+from .blocks import BlockSource, flip
+from .source import (
+    Frames,
+    Permit,
+    Source,
+    checked_claim,
+    checked_dtype,
+    checked_shape,
+    maybe_packed,
+    truncated,
+    unaccounted,
+    widened,
+    words,
+)
 from .tiff_codecs import CODECS, PART_BYTES, check_codestreams
 from .tiff_metadata import Description, parse_description
-from .tiff_pages import Page, walk
+from .tiff_pages import ORIENTATION, SUB_PAGES, Page, Tags, walk
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it warns of is an error here, with a remedy
 
-_DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
+DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
 """What tifffile and its codecs raise on damaged pages."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PagedSource(Source):
-    """Compressed, tiled or scattered pages; ``directories`` are the places of their tags."""
+    """Compressed, tiled or scattered pages.
+
+    Attributes
+    ----------
+    directories
+        The places of their tags.
+    flipped
+        Bits that are the other way round than meant.
+    """
 
     directories: NDArray[np.int64]
+    flipped: int = 0
 
     @property
     def one_by_one(self) -> bool:
@@ -43,18 +65,30 @@ class PagedSource(Source):
         try:
             with tifffile.TiffFile(self.files[0]) as tiff:
                 for k, directory in enumerate(directories.tolist()):
-                    tiff.filehandle.seek(directory)
-                    page = tifffile.TiffPage(tiff, index=start + k)
-                    check_codestreams(tiff.filehandle, page, self.path)
-                    frames[k] = widened(page.asarray(maxworkers=1).reshape(self.shape[1:]), self.dtype)
-        except _DAMAGE as error:
-            raise SourceError(
-                f"page {start + k} (counted from 0) cannot be decoded",
-                self.path,
-                got=words(error),
-                remedy="Export the movie again, uncompressed if that helps",
-            ) from error
+                    frames[k] = widened(decoded(tiff, directory, start + k, self.shape[1:]), self.dtype)
+        except DAMAGE as error:
+            raise undecoded(start + k, self.path, error) from error
+        flip(frames, self.flipped)
         return frames
+
+
+def decoded(tiff: tifffile.TiffFile, directory: int, number: int, shape: tuple[int, ...]) -> Frames:
+    """Return the page whose tags are at a place, decoded; ``shape`` is that of the movie's pages."""
+    tiff.filehandle.seek(directory)
+    page = tifffile.TiffPage(tiff, index=number)
+    check_codestreams(tiff.filehandle, page, tiff.filehandle.path)
+    frame: Frames = page.asarray(maxworkers=1).reshape(shape)
+    return frame
+
+
+def undecoded(number: int, where: str, error: Exception) -> SourceError:
+    """Return the error for a page that is damaged."""
+    return SourceError(
+        f"page {number} (counted from 0) cannot be decoded",
+        where,
+        got=words(error),
+        remedy="Export the movie again, uncompressed if that helps",
+    )
 
 
 def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
@@ -65,26 +99,32 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit |
     SourceError
         Where the file is damaged or cut short, pages differ, or pixels are colours or complex.
     """
-    pages, tags = walk(path)
+    pages, tags, tag_bytes = walk(path)
+    stored_bytes = tag_bytes + sum(page.n_stored for page in pages)
     pages = [page for page in pages if not page.reduced]
     if not pages:
         raise SourceError(
             "the movie has no frames", str(path), "at least one page", "none", "Check how it was exported"
         )
     _check_first(pages[0], path)
-    description = parse_description(tags, path, len(pages))
+    description = parse_description(tags, path, pages)
     if description.order is not None and len(pages) >= len(description.order):
         pages = _ordered(pages, description.order, path)
     _check_alike(pages, path)
     n_frames = max(description.frames or 0, len(pages))
     shape = checked_shape((n_frames, *pages[0].shape), str(path))
-    dtype = checked_dtype(pages[0].stored, str(path))
     offsets = _offsets(pages, n_frames, description, path)
+    dtype, flipped, notes = _meaning(pages[0], description, path)
+    stored_bytes += (n_frames - len(pages)) * pages[0].n_stored if n_frames > len(pages) else 0
+    notes += _turned(tags, path) + maybe_packed(dtype, pages[0].shape, path.name)
+    notes += () if SUB_PAGES in tags else unaccounted(path.name, path.stat().st_size - stored_bytes, pages[0].n_stored)
+    metadata = replace(description.metadata, notes=(*description.metadata.notes, *notes))
     common: dict[str, Any] = {
         "path": str(path),
         "files": (path,),
         "format": description.format,
-        "metadata": description.metadata,
+        "metadata": merged(metadata, known_beside(path, n_frames, permit), "the file next to it"),
+        "flipped": flipped,
     }
     if all(page.plain for page in pages):
         return BlockSource(**common, shape=shape, dtype=dtype, offsets=offsets, stored=pages[0].stored)
@@ -93,16 +133,49 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit |
     return PagedSource(**common, shape=shape, dtype=dtype, directories=directories)
 
 
+_COLOURS = {2: "RGB colours", 5: "CMYK colours", 6: "YCbCr colours", 8: "CIE L*a*b* colours"}
+_RAW_COLOURS = 32803
+_PALETTE = 3
+
+
 def _check_first(page: Page, path: Path) -> None:
-    if len(page.shape) > 2:
+    """Refuse colours, by their names."""
+    colours = _COLOURS.get(page.photometric, "several values each, as in a colour image")
+    if page.photometric == _RAW_COLOURS or len(page.shape) > 2:
+        several = ("are " if page.photometric in _COLOURS else "have ") + colours
+        several += " with transparency" if page.photometric == 2 and page.shape[2:] == (4,) else ""
         raise SourceError(
-            "the pixels have several values each, as in a colour image",
+            f"the pixels {'lie behind a mosaic of colour filters' if len(page.shape) == 2 else several}",
             str(path),
             "one intensity a pixel",
-            f"{' x '.join(map(str, page.shape[2:]))} values a pixel",
+            f"{' x '.join(map(str, page.shape[2:])) or '1'} values a pixel",
             "Save the movie as greyscale, from the data and not from the screen",
         )
     checked_dtype(page.stored, str(path))
+
+
+def _meaning(page: Page, description: Description, path: Path) -> tuple[np.dtype[Any], int, tuple[str, ...]]:
+    """Return the type of the pixels that are meant, which bits are stored the other way round, and notes on it."""
+    dtype = checked_dtype(page.stored, str(path))
+    where = path.name
+    if page.photometric == _PALETTE:
+        note = f"{where}: its pixels are numbers of a table of colours (palette); they are read as stored"
+        return dtype, 0, (note,)
+    if description.signed:
+        return np.dtype(f"i{dtype.itemsize}"), 1 << (8 * dtype.itemsize - 1), ()
+    if page.photometric != 0:
+        return dtype, 0, ()
+    if description.as_shown or dtype.kind == "f":
+        return dtype, 0, (f"{where} is shown with white for 0 (MinIsWhite); its numbers are read as stored",)
+    n_bits = 8 * dtype.itemsize if dtype.kind == "i" else page.n_bits
+    return dtype, (1 << n_bits) - 1, (f"{where} stores white as 0 (MinIsWhite); its numbers are turned over",)
+
+
+def _turned(tags: Tags, path: Path) -> tuple[str, ...]:
+    orientation = (tags.get(ORIENTATION) or (1,))[0]
+    if not 2 <= orientation <= 8:
+        return ()
+    return (f"{path.name} is to be shown turned or mirrored (orientation {orientation}); it is read as it is stored",)
 
 
 def _check_claims(pages: list[Page], path: Path) -> None:
@@ -132,7 +205,7 @@ def _check_claims(pages: list[Page], path: Path) -> None:
 def _check_alike(pages: list[Page], path: Path) -> None:
     first = pages[0]
     for number, page in enumerate(pages):
-        if page.shape != first.shape or page.stored != first.stored:
+        if (page.shape, page.stored, page.photometric) != (first.shape, first.stored, first.photometric):
             raise SourceError(
                 f"page {number} (counted from 0) differs from the first page",
                 str(path),
@@ -143,7 +216,8 @@ def _check_alike(pages: list[Page], path: Path) -> None:
 
 
 def _words(page: Page) -> str:
-    return f"{' x '.join(map(str, page.shape))} {page.stored.newbyteorder('=')}"
+    kind = {0: ", white is 0", 1: "", _PALETTE: ", a palette"}.get(page.photometric, f", colours {page.photometric}")
+    return f"{' x '.join(map(str, page.shape))} {page.stored.newbyteorder('=')}{kind}"
 
 
 def _ordered(pages: list[Page], order: tuple[int, ...], path: Path) -> list[Page]:

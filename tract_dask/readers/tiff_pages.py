@@ -22,18 +22,46 @@ Tags: TypeAlias = dict[int, Any]
 _TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii", 11: "f", 12: "d"}
 _TYPES |= {13: "I", 16: "Q", 17: "q", 18: "Q"}
 
-SUBFILE, WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER = 254, 256, 257, 258, 259, 266
+SUBFILE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, FILL_ORDER = 254, 256, 257, 258, 259, 262, 266
 STRIP_OFFSETS, SAMPLES, STRIP_ROWS, STRIP_BYTES, PREDICTOR = 273, 277, 278, 279, 317
 TILE_WIDTH, TILE_LENGTH, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT, DEPTH = 322, 323, 324, 325, 339, 32997
 DESCRIPTION, X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT = 270, 282, 283, 296
 DM_UNITS, DM_SCALES = (65003, 65004, 65005), (65009, 65010, 65011)
+ORIENTATION, SUB_PAGES, STK_ABOUT, STK_PLANES = 274, 330, 33628, 33629
+SEM_TEXTS = (34680, 34682, 34118)
+"""FEI's two, and Zeiss's."""
+
+EER_ABOUT = 65001
 
 _PLACES = frozenset((STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES))
 _NEEDED = _PLACES | frozenset(
-    (SUBFILE, WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER, SAMPLES, STRIP_ROWS, PREDICTOR, TILE_WIDTH, TILE_LENGTH)
+    (
+        SUBFILE,
+        WIDTH,
+        LENGTH,
+        BITS,
+        COMPRESSION,
+        PHOTOMETRIC,
+        FILL_ORDER,
+        SAMPLES,
+        STRIP_ROWS,
+        PREDICTOR,
+        TILE_WIDTH,
+        TILE_LENGTH,
+    )
 )
 _NEEDED |= frozenset((SAMPLE_FORMAT, DEPTH))
+_AS_BYTES = frozenset((*SEM_TEXTS, EER_ABOUT))
+"""Opaque data, whose type some programs call whole numbers."""
+
+_AS_PLACES = frozenset((STK_ABOUT, STK_PLANES))
+"""Tags that hold more than they say: their value here is (count, place)."""
+
 _OF_THE_FIRST = frozenset((DESCRIPTION, X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, *DM_UNITS, *DM_SCALES))
+_OF_THE_FIRST |= _AS_BYTES | _AS_PLACES | frozenset((ORIENTATION, SUB_PAGES))
+
+_UNKNOWN = 1 << 62
+"""Bytes of a page that does not say how many it has."""
 
 _FEW = 64
 """So many numbers are read of a tag that does not say where pixels are."""
@@ -61,6 +89,12 @@ class Page:
         A small copy of another page.
     compression
         The number of its codec.
+    n_stored
+        Bytes of its data in the file.
+    n_bits
+        Bits of a sample.
+    photometric
+        What its numbers mean: 0 white is 0, 1 black is 0, 3 the numbers of a table of colours, others are colours.
     """
 
     directory: int
@@ -72,6 +106,9 @@ class Page:
     plain: bool
     reduced: bool
     compression: int
+    n_stored: int
+    n_bits: int
+    photometric: int
 
 
 @dataclass(frozen=True)
@@ -105,8 +142,8 @@ class _Tiff:
         return self.file.read(n_bytes)
 
 
-def walk(path: Path) -> tuple[list[Page], Tags]:
-    """Return all pages of a TIFF in order, and the tags of the first that say something of the movie.
+def walk(path: Path) -> tuple[list[Page], Tags, int]:
+    """Return all pages of a TIFF in order, the tags of the first that say something of the movie, and all tags' bytes.
 
     Raises
     ------
@@ -120,7 +157,7 @@ def walk(path: Path) -> tuple[list[Page], Tags]:
         pages: list[Page] = []
         first_tags: Tags = {}
         seen = set()
-        read = 0
+        read = 8 if dialect.pointer == "I" else 16
         while following:
             if following in seen:
                 raise _damaged_chain(f"page {len(pages)} leads back to an earlier page", path)
@@ -137,7 +174,7 @@ def walk(path: Path) -> tuple[list[Page], Tags]:
             first_tags = first_tags or tags
             pages.append(page)
             following = after
-    return pages, first_tags
+    return pages, first_tags, read
 
 
 _SLACK = 1 << 16
@@ -180,8 +217,9 @@ def _directory(tiff: _Tiff, start: int, number: int) -> tuple[dict[int, tuple[in
         expected = start + count_bytes + n_bytes + pointer_bytes
         raise truncated(str(tiff.path), f"before the directory of page {number} (counted from 0)", expected, tiff.size)
     entries = {tag: (kind, count, raw) for tag, kind, count, raw in entry.iter_unpack(tail[:n_bytes])}
-    elsewhere = sum(n for kind, count, _ in entries.values() if (n := _n_bytes(kind, count)) <= tiff.size)
-    return entries, dialect.parse(dialect.pointer, tail[n_bytes:])[0], len(tail) + elsewhere
+    sizes = [_n_bytes(kind, count) for kind, count, _ in entries.values()]
+    elsewhere = sum(n for n in sizes if struct.calcsize(dialect.pointer) < n <= tiff.size)
+    return entries, dialect.parse(dialect.pointer, tail[n_bytes:])[0], count_bytes + len(tail) + elsewhere
 
 
 def _n_bytes(kind: int, count: int) -> int:
@@ -190,7 +228,9 @@ def _n_bytes(kind: int, count: int) -> int:
 
 def _value(tiff: _Tiff, tag: int, kind: int, count: int, raw: bytes) -> Any:
     """Return the value of a tag; empty where its type is unfit or it lies outside the file."""
-    code = _TYPES.get(kind, "")
+    code = "s" if tag in _AS_BYTES and kind in (1, 2, 6, 7) else _TYPES.get(kind, "")
+    if tag in _AS_PLACES:
+        return count, tiff.dialect.parse(tiff.dialect.pointer, raw)[0]
     if not code or (tag in _NEEDED and code not in "BHIQbhiq"):
         return ()
     n_bytes = _n_bytes(kind, count)
@@ -238,6 +278,7 @@ def _page(tags: Tags, directory: int, dialect: Dialect, path: Path, number: int)
     plain = raw and not several and n_bits == 8 * stored.itemsize and _adjacent(offsets, part[0] * row_bytes)
     end = int(offsets[0]) + n_y * row_bytes if plain else _end(offsets[:needed], counts[:needed])
     n_bytes = part[0] * part[1] * stored.itemsize
+    n_stored = n_y * row_bytes if plain else int(counts[:needed].astype(np.float64).sum()) if len(counts) else _UNKNOWN
     return Page(
         directory,
         (n_y, n_x, *several),
@@ -248,6 +289,9 @@ def _page(tags: Tags, directory: int, dialect: Dialect, path: Path, number: int)
         plain,
         bool(first(SUBFILE) & 1),
         first(COMPRESSION, 1),
+        n_stored,
+        n_bits,
+        first(PHOTOMETRIC, 1),
     )
 
 

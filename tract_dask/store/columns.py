@@ -6,7 +6,6 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from ..kernels.gaussian import parameters
 from . import schema
 from .files import read_small
 from .schema import Status
+from .tables import decoded, parse_number, parse_table
 
 _FIT_COLUMNS = tuple(name for name in parameters.PARAMETERS if name not in ("x", "y"))
 
@@ -155,7 +155,7 @@ def read_columns_csv(path: str | Path) -> xr.Dataset:
         missing, a number is none, or an ID comes twice; naming the line.
     """
     try:
-        text = read_small(path, MOST_BYTES).decode("utf-8-sig")
+        text = decoded(read_small(path, MOST_BYTES))
     except (OSError, UnicodeDecodeError) as error:
         raise _unreadable(str(path), error) from error
     return parse_columns_csv(text, str(path))
@@ -166,8 +166,8 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
 
     Its first line names the columns: ``x`` and ``y`` (px) must be there, ``column_id`` (whole numbers from 0 on, each
     once) and ``kind`` may be; a fit and flags are read where :func:`columns_csv` has written them, others are
-    ignored. Without IDs the columns are numbered from 1 in the order of the table. Empty lines and those that begin
-    with ``#`` are skipped.
+    ignored. Without IDs the columns are numbered from 1 in the order of the table. Separators and decimal commas are
+    understood as :func:`~tract_dask.store.tables.parse_table` does.
 
     Parameters
     ----------
@@ -182,9 +182,7 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
         As :func:`read_columns_csv`.
     """
     header, rows = _rows(text, where)
-    for line, values in rows:
-        _check_width(values, header, f"{where}, line {line}")
-    numbers = [_Row(where, line, dict(zip(header, values, strict=False))) for line, values in rows]
+    numbers = [_Row(where, line, dict(zip(header, values, strict=True))) for line, values in rows]
     places = [[row.number("x"), row.number("y")] for row in numbers]
     ids = [row.integer("column_id") for row in numbers] if "column_id" in header else None
     first: dict[int, int] = {}
@@ -208,18 +206,6 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
     return column_dataset(places, kinds, ids, fit, [row.flags() for row in numbers])
 
 
-def _check_width(row: list[str], header: list[str], where: str) -> None:
-    """Refuse a row with more values than there are columns, as numbers with commas for their points have."""
-    if any(row[len(header) :]):
-        raise SettingsError(
-            "there are more values than the first line names",
-            where,
-            f"{len(header)} values: {', '.join(header)}",
-            f"{len(row)}: {', '.join(row)}"[:200],
-            "Write numbers with a point, and text with commas in quotes",
-        )
-
-
 def _unreadable(where: str, error: Exception) -> SettingsError:
     what = "the columns file cannot be read"
     return SettingsError(what, where, "a CSV file", str(error), "Check its path, and save it as CSV in UTF-8")
@@ -227,26 +213,20 @@ def _unreadable(where: str, error: Exception) -> SettingsError:
 
 def _rows(text: str, where: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the names of a table's columns and its (line, values), stripped; x, y and one row are there."""
-    reader = csv.reader(io.StringIO(text, newline=""))
-    try:
-        lines = [(reader.line_num, [value.strip() for value in row]) for row in islice(reader, MOST_ROWS + 2)]
-    except csv.Error as error:
-        raise _unreadable(where, error) from error
-    if len(lines) > MOST_ROWS + 1:
+    table = parse_table(text, where, most=MOST_ROWS)
+    if len(table.rows) > MOST_ROWS:
         raise SettingsError("the columns file is too long", where, f"at most {MOST_ROWS} lines", "more", "Shorten it")
-    lines = [(line, row) for line, row in lines if any(row) and not row[0].startswith("#")]
-    header = lines[0][1] if lines else []
-    if not lines or not {"x", "y"} <= set(header):
+    if not {"x", "y"} <= set(table.header):
         raise SettingsError(
-            "the columns file does not say where the columns are" if lines else "the columns file is empty",
-            f"{where}, line {lines[0][0]}" if lines else where,
-            "a first line that names the columns x and y, separated by commas",
-            ", ".join(header) or "no line",
+            "the columns file does not say where the columns are" if table.header else "the columns file is empty",
+            f"{where}, line {table.line}" if table.header else where,
+            "a first line that names the columns x and y, separated by commas, semicolons or tabs",
+            ", ".join(table.header) or "no line",
             "Name them in the first line: x,y or column_id,x,y,kind",
         )
-    if len(lines) == 1:
+    if not table.rows:
         raise SettingsError("the columns file is empty", where, "a row for each column", "the first line alone")
-    return header, lines[1:]
+    return table.header, table.rows
 
 
 class _Row:
@@ -257,7 +237,7 @@ class _Row:
 
     def number(self, name: str) -> float:
         try:
-            value = float(self.values.get(name, ""))
+            value = parse_number(self.values.get(name, ""))
         except ValueError:
             value = float("nan")
         if not math.isfinite(value):

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -20,6 +17,7 @@ from ...store.files import read_small
 from ...store.keys import counted
 from ...store.movie import Movie
 from ...store.provenance import stage_key
+from ...store.tables import decoded, parse_number, parse_table
 from ..keep import Workers, content, kept
 from .measure import drift_dataset, measure_drift
 
@@ -78,7 +76,8 @@ def estimate_drift(
 def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
     """Return the drift in a CSV file with columns frame, y, x: (frames, 2) in px, as it stands there.
 
-    Rows may come in any order; other columns are ignored; frames count from 0. The file may have 1 MiB and 512 bytes
+    Rows may come in any order; other columns are ignored; frames count from 0; separators and decimal commas are
+    understood as :func:`~tract_dask.store.tables.parse_table` does. The file may have 1 MiB and 512 bytes
     a frame.
 
     Raises
@@ -91,27 +90,21 @@ def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
     drift = np.full((n_frames, 2), np.nan)
     line_of: dict[int, int] = {}
     try:
-        text = read_small(path, (1 << 20) + 512 * n_frames).decode("utf-8-sig")
-        with io.StringIO(text, newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = header
-            missing = [name for name in ("frame", "y", "x") if name not in header]
-            if missing:
-                expected, got = "columns frame, y, x", ", ".join(header) or "an empty file"
-                raise SourceError(f"column {missing[0]!r} is missing", f"{path}, line 1", expected, got, remedy)
-            for row in reader:
-                where = f"{path}, line {reader.line_num}"
-                if any(value.strip() for value in row.pop(None, ())):
-                    expected, got = f"{len(header)}: {', '.join(header)}", "more: numbers are written with a point"
-                    raise SourceError("there are more values than the first line names", where, expected, got, remedy)
-                frame, shift = _parse_row(row, where, n_frames, remedy)
-                if frame in line_of:
-                    what = f"frame {frame} occurs twice"
-                    raise SourceError(what, where, "each frame once", f"also in line {line_of[frame]}", remedy)
-                line_of[frame], drift[frame] = reader.line_num, shift
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        text = decoded(read_small(path, (1 << 20) + 512 * n_frames))
+    except (OSError, UnicodeDecodeError) as error:
         raise SourceError("the drift file cannot be read", str(path), got=str(error), remedy=remedy) from error
+    table = parse_table(text, str(path), SourceError)
+    missing = [name for name in ("frame", "y", "x") if name not in table.header]
+    if missing:
+        expected, got = "columns frame, y, x", ", ".join(table.header) or "an empty file"
+        raise SourceError(f"column {missing[0]!r} is missing", f"{path}, line {table.line}", expected, got, remedy)
+    for line, values in table.rows:
+        where = f"{path}, line {line}"
+        frame, shift = _parse_row(dict(zip(table.header, values, strict=True)), where, n_frames, remedy)
+        if frame in line_of:
+            what = f"frame {frame} occurs twice"
+            raise SourceError(what, where, "each frame once", f"also in line {line_of[frame]}", remedy)
+        line_of[frame], drift[frame] = line, shift
     absent = np.flatnonzero(np.isnan(drift[:, 0]))
     if absent.size:
         got = f"{len(line_of)} frames; the first one missing is {absent[0]}"
@@ -119,10 +112,10 @@ def read_drift_csv(path: str | Path, n_frames: int) -> Floats:
     return drift
 
 
-def _parse_row(row: dict[str, Any], where: str, n_frames: int, remedy: str) -> tuple[int, tuple[float, float]]:
+def _parse_row(row: dict[str, str], where: str, n_frames: int, remedy: str) -> tuple[int, tuple[float, float]]:
     try:
-        frame, y, x = (float(row[name]) for name in ("frame", "y", "x"))
-    except (TypeError, ValueError):
+        frame, y, x = (parse_number(row[name]) for name in ("frame", "y", "x"))
+    except ValueError:
         got = ", ".join(repr(row[name]) for name in ("frame", "y", "x"))
         raise SourceError("this is not a number", where, "three numbers", got, remedy) from None
     if not np.isfinite([y, x]).all():
