@@ -149,7 +149,7 @@ def open_source(
 def _not_applied(known: SourceMetadata) -> tuple[str, ...]:
     """Return notes on the references of the detector that no note names yet."""
     return tuple(
-        f"{file.name} next to the movie is the detector's {kind} reference, by its name; it is not applied to the frames"
+        f"{file.name} next to the movie is by its name the detector's {kind} reference; it is not applied"
         for kind, file in known.references.items()
         if kind != "metadata" and not any(file.name in note for note in known.notes)
     )
