@@ -47,7 +47,6 @@ def test_missing_file(tmp_path: Path) -> None:
     ("name", "words"),
     [
         ("movie.dm4", ("DigitalMicrograph files are not read yet", ".tif", "got .dm4", "Export")),
-        ("movie.emd", ("EMD files are not read yet",)),
         ("movie.ser", ("TIA files are not read yet",)),
         ("movie.avi", ("format is unknown", ".mrc", "got .avi", "--raw-shape")),
         ("movie", ("without a suffix",)),

@@ -38,7 +38,7 @@ def write(path: Path) -> Path:
         tifffile.imwrite(path, FRAMES, photometric="minisblack", compression="zlib" if suffix == ".tiff" else None)
     elif suffix == ".npy":
         np.save(path, FRAMES)
-    elif suffix in (".h5", ".hdf5", ".hspy"):
+    elif suffix in (".h5", ".hdf5", ".hspy", ".emd", ".nxs"):
         with h5py.File(path, "w") as file:
             file["data"] = FRAMES
     elif suffix in (".mrc", ".mrcs", ".st"):

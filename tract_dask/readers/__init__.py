@@ -18,6 +18,7 @@ from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
+from .dectris import is_part
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
 from .mrc import open_mrc
@@ -47,7 +48,9 @@ BUILT_IN = (
     Reader("TIFF", (".tif", ".tiff"), open_tiff),
     Reader("MRC", (".mrc", ".mrcs", ".st"), open_mrc),
     Reader("NumPy", (".npy",), open_npy),
-    Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
+    Reader(
+        "HDF5", (".h5", ".hdf5", ".hspy", ".emd", ".nxs"), open_hdf5, inside="the path of a data set", is_part=is_part
+    ),
     Reader("raw", (".raw", ".bin", ".dat"), open_raw),
 )
 """The formats that are read here."""
@@ -77,7 +80,7 @@ AS_THE_FILE_SAYS = MetadataSettings()
 
 _RAW = READERS[".raw"]
 
-_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA", ".emd": "EMD"}
+_VENDORS = {".dm3": "DigitalMicrograph", ".dm4": "DigitalMicrograph", ".ser": "TIA"}
 
 
 def open_source(

@@ -1,0 +1,170 @@
+"""The axes of an HDF5 data set: as HyperSpy, EMD, Velox, NeXus and HDF5's own dimension scales name them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from .axes import Axis, evenly
+from .source import words
+
+VELOX = re.compile(r"/Data/Image/[^/]+/Data")
+"""The path of the images of a Velox file."""
+
+_MOST_VALUES = 1 << 22
+
+DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
+"""What h5py raises on damaged objects."""
+
+
+def axes_of(dataset: Any, where: str) -> tuple[list[Axis], tuple[str, ...]]:
+    """Return what the file says of each axis of a data set; nothing, and a note, where that is damaged."""
+    try:
+        for known in (_velox, _hyperspy, _emd, _nexus, _scales):
+            if axes := known(dataset):
+                return axes, ()
+    except DAMAGE as error:
+        return [Axis()] * dataset.ndim, (f"{where}: its axes cannot be read ({words(error)})",)
+    return [Axis()] * dataset.ndim, ()
+
+
+def single(item: Any, name: str) -> Any:
+    """Return an attribute that holds one value; empty where it is not there, or holds many."""
+    if name not in item.attrs or item.attrs.get_id(name).shape not in ((), (1,)):
+        return ""
+    return item.attrs[name]
+
+
+def text(value: Any) -> str:
+    """Return a text however it is stored."""
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def number(value: Any) -> float:
+    """Return a number; NaN where it is none."""
+    try:
+        return float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def within(group: Any, name: str, kind: type) -> Any:
+    """Return a member that lies in the group itself; None where it is not there: no link is followed for a unit."""
+    if not isinstance(group, h5py.Group) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        return None
+    item = group[name]
+    return item if isinstance(item, kind) else None
+
+
+def numbers_of(dataset: Any) -> NDArray[np.float64] | None:
+    """Return the numbers of a data set with one axis; None where they are texts or others, or too many."""
+    if dataset.ndim != 1 or dataset.dtype.kind not in "iuf" or not 0 < dataset.shape[0] <= _MOST_VALUES:
+        return None
+    if dataset.chunks and math.prod(dataset.chunks) > _MOST_VALUES:
+        return None
+    return np.asarray(dataset[()], np.float64)
+
+
+def _velox(dataset: Any) -> list[Axis]:
+    fits = VELOX.fullmatch(dataset.name or "") and dataset.ndim == 3
+    return [Axis("y"), Axis("x"), Axis("frame")] if fits else []
+
+
+def _hyperspy(dataset: Any) -> list[Axis]:
+    group = dataset.parent
+    found = [within(group, f"axis-{k}", h5py.Group) for k in range(dataset.ndim)]
+    return [Axis() if item is None else _hyperspy_axis(item) for item in found] if any(found) else []
+
+
+def _hyperspy_axis(item: Any) -> Axis:
+    navigate = single(item, "navigate")
+    values = within(item, "axis", h5py.Dataset)
+    listed = None if values is None else numbers_of(values)
+    return Axis(
+        text(single(item, "name")),
+        text(single(item, "units")),
+        number(single(item, "scale")) if listed is None else evenly(listed),
+        None if isinstance(navigate, str | bytes) else not bool(navigate),
+        listed,
+    )
+
+
+def _emd(dataset: Any) -> list[Axis]:
+    """Return the axes of an EMD group; those that HyperSpy wrote without names are in the order x, y, frame."""
+    group = dataset.parent
+    names = sorted((name for name in group if re.fullmatch(r"dim\d{1,3}", name)), key=lambda name: int(name[3:]))
+    if "emd_group_type" not in group.attrs or len(names) < dataset.ndim:
+        return []
+    found = [within(group, name, h5py.Dataset) for name in names[: dataset.ndim]]
+    axes = [Axis() if item is None else _listed(item, "name") for item in found]
+    if "record_by" in group.attrs and not any(axis.name for axis in axes) and dataset.ndim in (2, 3):
+        said = zip(("x", "y", "frame"), axes, strict=False)
+        return [Axis(name, axis.unit, axis.scale, axis.in_image, axis.values) for name, axis in said]
+    return axes
+
+
+def _listed(item: Any, name: str) -> Axis:
+    """Return an axis whose places, or the first two of them, are a data set."""
+    values = numbers_of(item)
+    step = math.nan if values is None else evenly(values)
+    return Axis(text(single(item, name)), text(single(item, "units")), step, values=values)
+
+
+def _nexus(dataset: Any) -> list[Axis]:
+    group = dataset.parent
+    short = (dataset.name or "").rpartition("/")[2]
+    named = group.attrs if text(single(group, "signal")) == short and "axes" in group.attrs else dataset.attrs
+    if "axes" not in named:
+        return []
+    names = [text(name) for name in np.atleast_1d(named["axes"])]
+    if len(names) == 1:
+        names = [name for name in re.split(r"[\s:,\[\]]+", names[0]) if name]
+    places = {_place(group, name, k): name for k, name in enumerate(names)}
+    return [_nexus_axis(group, places.get(k, ".")) for k in range(dataset.ndim)]
+
+
+def _place(group: Any, name: str, usual: int) -> int:
+    given = number(single(group, f"{name}_indices"))
+    return int(given) if given == given and abs(given) < 100 else usual
+
+
+def _nexus_axis(group: Any, name: str) -> Axis:
+    item = within(group, name, h5py.Dataset) if name != "." else None
+    found = Axis() if item is None else _listed(item, "")
+    return Axis("" if name == "." else name, found.unit, found.scale, values=found.values)
+
+
+def _scales(dataset: Any) -> list[Axis]:
+    """Return the axes by HDF5's labels and dimension scales, as netCDF has them."""
+    axes = [_scale(dataset.dims[k]) for k in range(dataset.ndim)]
+    return axes if any(axis.name for axis in axes) else []
+
+
+def _scale(dimension: Any) -> Axis:
+    if not len(dimension):
+        return Axis(dimension.label)
+    item = dimension[0]
+    found = _listed(item, "")
+    return Axis(dimension.label or (item.name or "").rpartition("/")[2], found.unit, found.scale, values=found.values)
+
+
+def is_signal(dataset: Any) -> bool:
+    """Tell whether its group says that a data set is what the group is about."""
+    group, short = dataset.parent, (dataset.name or "").rpartition("/")[2]
+    rules: tuple[Callable[[], bool], ...] = (
+        lambda: bool(VELOX.fullmatch(dataset.name or "")),
+        lambda: "emd_group_type" in group.attrs and not short.startswith("dim"),
+        lambda: text(single(group, "signal")) == short,
+        lambda: short == "data" and within(group, "axis-0", h5py.Group) is not None,
+    )
+    try:
+        return any(rule() for rule in rules)
+    except DAMAGE:
+        return False
