@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from files_hdf5 import small_zarr
 
 from tract_dask.errors import InputError, SourceError
 from tract_dask.readers import READERS, open_cached, open_source
@@ -41,6 +42,8 @@ def write(path: Path) -> Path:
     elif suffix in (".h5", ".hdf5", ".hspy", ".emd", ".nxs"):
         with h5py.File(path, "w") as file:
             file["data"] = FRAMES
+    elif suffix in (".zarr", ".zspy"):
+        small_zarr(path, FRAMES)
     elif suffix in (".mrc", ".mrcs", ".st"):
         header = np.zeros(256, "<i4")
         header[:4] = *FRAMES.shape[::-1], 6

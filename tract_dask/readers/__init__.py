@@ -28,6 +28,8 @@ from .registry import Reader, by_suffix
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tiff import open_tiff
+from .zarr_arrays import open_zarr
+from .zarr_place import is_zarr
 
 __all__ = [
     "READERS",
@@ -51,6 +53,7 @@ BUILT_IN = (
     Reader(
         "HDF5", (".h5", ".hdf5", ".hspy", ".emd", ".nxs"), open_hdf5, inside="the path of a data set", is_part=is_part
     ),
+    Reader("Zarr", (".zarr", ".zspy"), open_zarr, inside="the path of an array", is_movie=is_zarr),
     Reader("raw", (".raw", ".bin", ".dat"), open_raw),
 )
 """The formats that are read here."""

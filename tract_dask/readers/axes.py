@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -293,3 +293,44 @@ def plain_unit(unit: str) -> str:
 def evenly(values: NDArray[np.float64]) -> float:
     """Return the step of values that lie at even distances; the median step otherwise, NaN of less than two."""
     return float(np.median(np.diff(values))) if len(values) > 1 else math.nan
+
+
+DECLARED = ("pixel_size_", "frame_time_")
+"""Beginnings of attributes that programs give to arrays, with the unit behind."""
+
+
+def declared(attributes: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """Return pixel size (pm) and frame time (s) by attributes such as ``pixel_size_nm`` and ``frame_time_ms``.
+
+    Examples
+    --------
+    >>> declared({"pixel_size_nm": 0.5, "frame_time_ms": "25", "pixel_size": 3})
+    (500.0, 0.025)
+    """
+    pixel = seconds = None
+    for name, value in attributes.items():
+        unit = name.rpartition("_")[2]
+        if name == f"pixel_size_{unit}":
+            pixel = to_pm(as_number(value), unit) or pixel
+        elif name == f"frame_time_{unit}":
+            seconds = to_seconds(as_number(value), unit) or seconds
+    return pixel, seconds
+
+
+def as_number(value: Any) -> float:
+    """Return a number; NaN where it is none."""
+    try:
+        return float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def packing(scale: float, offset: float, where: str) -> tuple[str, ...]:
+    """Return a note where netCDF says that values are to be scaled: they are read as they are stored."""
+    factor, added = 1.0 if math.isnan(scale) else scale, 0.0 if math.isnan(offset) else offset
+    if (factor, added) == (1.0, 0.0):
+        return ()
+    return (
+        f"{where}: its values are meant to be multiplied by {factor:g} and {added:g} added (scale_factor, add_offset);"
+        " they are read as they are stored",
+    )

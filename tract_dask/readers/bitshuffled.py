@@ -240,7 +240,7 @@ def decode(data: NDArray[np.uint8], itemsize: int, codec: int, target: NDArray[n
         expected, length = min(block, whole - done), int.from_bytes(view[at : at + 4], "big")
         at += 4
         out = shuffled[done : done + expected]
-        if at + length > len(view) or len(unpack(view[at : at + length], out=out)) != expected:
+        if not 0 < length <= len(view) - at or len(unpack(view[at : at + length], out=out)) != expected:
             raise ValueError("a block of a chunk is damaged")
         at += length
     if len(view) - at < len(target) - whole:

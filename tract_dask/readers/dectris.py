@@ -11,7 +11,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .hdf5_axes import DAMAGE, number, single, text, within
+from .axes import as_number
+from .hdf5_axes import DAMAGE, single, text, within
 from .source import SourceMetadata
 from .units import to_seconds
 
@@ -88,7 +89,7 @@ def _seconds(detector: Any, name: str) -> float | None:
 
 def _number(group: Any, name: str) -> float:
     item = within(group, name, h5py.Dataset)
-    return float("nan") if item is None or item.size != 1 else number(item[()])
+    return float("nan") if item is None or item.size != 1 else as_number(item[()])
 
 
 def _gaps(names: list[str], where: str) -> tuple[str, ...]:

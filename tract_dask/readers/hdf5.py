@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +12,13 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings.run import SourceSettings
-from .axes import Axis, Order, calibrated, ordered
+from .axes import DECLARED, Axis, Order, as_number, calibrated, declared, ordered, packing
 from .bitshuffled import FILTER, BitshuffledSource, chunks_of, codec_of
 from .blocks import fill_from
+from .candidates import ambiguous, movies_of
 from .dectris import master_metadata, parts_of
-from .hdf5_axes import DAMAGE, axes_of, number, single
-from .hdf5_links import Access, Behind, Found, Segment, files_behind, follow, movies_below, opened
+from .hdf5_axes import DAMAGE, axes_of, single
+from .hdf5_links import Access, Behind, Segment, files_behind, follow, movies_below, opened
 from .hdf5_storage import check_storage
 from .joined import JoinedSource, check_alike
 from .source import (
@@ -33,7 +32,6 @@ from .source import (
     reading,
     widened,
 )
-from .units import to_pm, to_seconds
 from .velox import is_velox, velox_metadata
 
 
@@ -249,40 +247,11 @@ def _chosen(file: Any, inner: str, path: Path, access: Access) -> tuple[str, tup
         if isinstance(target, h5py.Dataset):
             return inner, ()
         search = movies_below(target, inner, access) if target is not None else movies_below(file, "", access)
-    movies = [] if target is None else _movies(search.found)
+    movies = [] if target is None else movies_of(search.found)
     if len(movies) == 1:
         lost = f" (and {len(search.lost) - 1} more)" if len(search.lost) > 1 else ""
         return movies[0].shown, (f"{path.name}: {search.lost[0]}{lost}",) if search.lost else ()
-    raise _ambiguous(path, inner, target, movies, movies or search.found, search.lost)
-
-
-def _movies(found: list[Found]) -> list[Found]:
-    """Return what could be the movie: first what is the subject of its group, then other arrays of numbers."""
-    numbers = [item for item in found if item.dtype.kind in "iufcb"]
-    signals = [item for item in found if item.signal]
-    deep = [[item for item in items if len(item.shape) == 3] for items in (signals, numbers)]
-    flat = [[item for item in items if len(item.shape) == 2] for items in (signals, numbers)]
-    several = [[item for item in items if min(item.shape) > 1 and item.dtype.kind in "iufb"] for items in deep]
-    ranked = (*several, *deep, *flat, [item for item in signals if len(item.shape) > 3])
-    alone = next((items for items in ranked if len(items) == 1), [])
-    most = next((items for items in ranked if items), [])
-    return alone if alone and (not most or alone[0] in most) else most
-
-
-def _ambiguous(
-    path: Path, inner: str, target: Any, movies: list[Found], found: list[Found], lost: list[str]
-) -> SourceError:
-    listing = ", ".join(f"{item.shown} {item.shape} {item.dtype}{item.label}" for item in found[:20])
-    holds = f"a file that holds {listing}" if listing else "a file without data sets"
-    return SourceError(
-        "there is nothing under this path"
-        if target is None
-        else f"there are {len(movies) or 'no'} data sets that could be the movie",
-        f"{path}::{inner}" if inner else str(path),
-        "the path of one data set with axes (frames, y, x)",
-        f"{holds}, where {'; '.join(lost[:9])}" if lost else holds,
-        f"Name it, for example {path.name}::{movies[0].shown}" if movies else "Name one of those, or check the file",
-    )
+    raise ambiguous(path, inner, movies, search.found, search.lost, there=target is not None)
 
 
 def _check_filters(dataset: Any, where: str, *, spared: bool) -> None:
@@ -313,23 +282,7 @@ def _metadata(file: Any, dataset: Any, axes: list[Axis], order: Order, where: st
     said = velox_metadata(dataset, where) if is_velox(dataset) else calibrated(axes, order, where)
     pixel, seconds = said.pixel_size_pm, said.frame_time_s
     for item in (file, dataset.file, dataset.parent, dataset):
-        for name in item.attrs:
-            if match := re.fullmatch(r"(pixel_size|frame_time)_([^_]+)", name):
-                convert, value = (to_pm if match[1] == "pixel_size" else to_seconds), number(single(item, name))
-                if match[1] == "pixel_size":
-                    pixel = convert(value, match[2]) or pixel
-                else:
-                    seconds = convert(value, match[2]) or seconds
-    return replace(said, pixel_size_pm=pixel, frame_time_s=seconds, notes=said.notes + _packing(dataset, where))
-
-
-def _packing(dataset: Any, where: str) -> tuple[str, ...]:
-    """Return a note where netCDF says that values are to be scaled: they are read as they are stored."""
-    found = [number(single(dataset, name)) for name in ("scale_factor", "add_offset")]
-    scale, offset = (usual if math.isnan(value) else value for value, usual in zip(found, (1.0, 0.0), strict=True))
-    if (scale, offset) == (1.0, 0.0):
-        return ()
-    return (
-        f"{where}: its values are meant to be multiplied by {scale:g} and {offset:g} added (scale_factor, add_offset);"
-        " they are read as they are stored",
-    )
+        found = declared({name: single(item, name) for name in item.attrs if name.startswith(DECLARED)})
+        pixel, seconds = found[0] or pixel, found[1] or seconds
+    scaled = packing(*(as_number(single(dataset, name)) for name in ("scale_factor", "add_offset")), where)
+    return replace(said, pixel_size_pm=pixel, frame_time_s=seconds, notes=said.notes + scaled)

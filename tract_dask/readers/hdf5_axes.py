@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .axes import Axis, evenly
+from .axes import Axis, as_number, evenly
 from .source import words
 
 VELOX = re.compile(r"/Data/Image/[^/]+/Data")
@@ -36,7 +36,7 @@ def axes_of(dataset: Any, where: str) -> tuple[list[Axis], tuple[str, ...]]:
 
 def single(item: Any, name: str) -> Any:
     """Return an attribute that holds one value; empty where it is not there, or holds many."""
-    if name not in item.attrs or item.attrs.get_id(name).shape not in ((), (1,)):
+    if not name or name not in item.attrs or item.attrs.get_id(name).shape not in ((), (1,)):
         return ""
     return item.attrs[name]
 
@@ -45,14 +45,6 @@ def text(value: Any) -> str:
     """Return a text however it is stored."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-
-
-def number(value: Any) -> float:
-    """Return a number; NaN where it is none."""
-    try:
-        return float(np.asarray(value).item())
-    except (TypeError, ValueError):
-        return math.nan
 
 
 def within(group: Any, name: str, kind: type) -> Any:
@@ -90,7 +82,7 @@ def _hyperspy_axis(item: Any) -> Axis:
     return Axis(
         text(single(item, "name")),
         text(single(item, "units")),
-        number(single(item, "scale")) if listed is None else evenly(listed),
+        as_number(single(item, "scale")) if listed is None else evenly(listed),
         None if isinstance(navigate, str | bytes) else not bool(navigate),
         listed,
     )
@@ -131,7 +123,7 @@ def _nexus(dataset: Any) -> list[Axis]:
 
 
 def _place(group: Any, name: str, usual: int) -> int:
-    given = number(single(group, f"{name}_indices"))
+    given = as_number(single(group, f"{name}_indices"))
     return int(given) if given == given and abs(given) < 100 else usual
 
 

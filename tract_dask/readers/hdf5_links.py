@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 
 from ..errors import MissingSourceError, SourceError
+from .candidates import Found
 from .hdf5_axes import DAMAGE, is_signal
 from .hdf5_storage import unwritten
 from .source import MOST_FRAMES, Permit, checked_file, reading, truncated, words
@@ -48,20 +48,6 @@ class Access:
         """Refuse a path that may not be opened although nothing is there: what others have is not to be told."""
         if self.permit is not None:
             self.permit(Path(os.path.realpath(path)))
-
-
-@dataclass(frozen=True)
-class Found:
-    """A data set: its path as seen from the file that the user named, its axes, and the type of its pixels.
-
-    ``signal`` tells whether its group says that it is what the group is about; ``label`` follows it in lists.
-    """
-
-    shown: str
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    signal: bool = False
-    label: str = ""
 
 
 @dataclass

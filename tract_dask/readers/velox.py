@@ -10,7 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .hdf5_axes import VELOX, number, text, within
+from .axes import as_number
+from .hdf5_axes import VELOX, text, within
 from .source import FrameValues, SourceMetadata
 from .units import square_pixel, to_pm, to_seconds
 
@@ -37,7 +38,7 @@ def velox_metadata(dataset: Any, where: str) -> SourceMetadata:
     first = said[0]
     sides = (("width", "PixelUnitX"), ("height", "PixelUnitY"))
     units = [text(_at(first, "BinaryResult", unit)) for _, unit in sides]
-    sizes = [number(_at(first, "BinaryResult", "PixelSize", side)) for side, _ in sides]
+    sizes = [as_number(_at(first, "BinaryResult", "PixelSize", side)) for side, _ in sides]
     pixel, notes = square_pixel(*(to_pm(size, unit) for size, unit in zip(sizes, units, strict=True)))
     if pixel is None and units[0] not in ("", "m"):
         notes = (f"{where}: its pixels are measured in {units[0]}, which is not a length; the pixel size is not known",)
@@ -77,10 +78,10 @@ def _frame_time(said: dict[str, Any], where: str) -> tuple[float | None, tuple[s
     name, detectors = _at(said, "BinaryResult", "Detector"), said.get("Detectors")
     listed = [one for one in detectors.values() if isinstance(one, dict)] if isinstance(detectors, dict) else []
     own: dict[str, Any] = next((one for one in listed if name and one.get("DetectorName") == name), {})
-    frame, exposure = number(_at(said, "Scan", "FrameTime")), number(_at(own, "ExposureTime"))
+    frame, exposure = as_number(_at(said, "Scan", "FrameTime")), as_number(_at(own, "ExposureTime"))
     if own.get("DetectorType") != "ImagingDetector" or math.isnan(exposure):
         return to_seconds(frame, "s"), ()
-    if frame >= exposure and number(_at(said, "Scan", "ScanSize", "width")) == 0:
+    if frame >= exposure and as_number(_at(said, "Scan", "ScanSize", "width")) == 0:
         return to_seconds(frame, "s"), ()
     seconds = to_seconds(exposure, "s")
     return seconds, (f"{where}: the frame time is the camera's exposure time",) if seconds else ()
@@ -90,7 +91,7 @@ def _along(said: list[dict[str, Any]]) -> dict[str, FrameValues]:
     """Return the tilt of the stage and the temperature of the holder along the frames, where they are known."""
     tilts = {"stage_tilt": "AlphaTilt", "stage_tilt_beta": "BetaTilt"}
     found = {
-        name: FrameValues(np.degrees([number(_at(one, "Stage", key)) for one in said]), "deg")
+        name: FrameValues(np.degrees([as_number(_at(one, "Stage", key)) for one in said]), "deg")
         for name, key in tilts.items()
     }
     found["temperature"] = FrameValues(np.array([_temperature(one) for one in said]), "degC")
@@ -101,5 +102,5 @@ def _temperature(said: dict[str, Any]) -> float:
     """Return the holder's temperature; NaN where no property of the user's or of the stage names one in degC."""
     custom = said.get("CustomProperties")
     named = custom.items() if isinstance(custom, dict) else ()
-    found = (number(_at(value, "value")) for name, value in named if name.lower().endswith("temperature"))
+    found = (as_number(_at(value, "value")) for name, value in named if name.lower().endswith("temperature"))
     return next((value for value in found if not math.isnan(value)), math.nan)
