@@ -238,3 +238,12 @@ def test_pixels_of_a_virtual_data_set_that_come_from_nowhere(tmp_path: Path) -> 
     notes = " ".join(open_source(tmp_path / "a.h5").metadata.notes)
     assert "4,320 of 11,520 pixels of the virtual data set come from no file" in notes
     assert "part.h5::/data: 3 of 5 chunks were never written" in notes
+
+
+def test_a_heap_of_texts_without_an_end(tmp_path: Path) -> None:
+    path = nexus(tmp_path / "a.nxs", FRAMES, ["frame", "y", "x"])
+    whole = bytearray(path.read_bytes())
+    at = whole.index(b"GCOL") + 16
+    whole[at : at + 400] = bytes(400)
+    path.write_bytes(whole)
+    fails(path, "the texts in the file are damaged")

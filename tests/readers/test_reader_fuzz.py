@@ -9,10 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import hdf5plugin
 import mrcfile
 import numpy as np
 import pytest
 import tifffile
+from files_hdf5 import small_zarr, velox
 
 from tract_dask.errors import TractError
 from tract_dask.readers import open_source
@@ -93,6 +95,25 @@ def emd(path: Path) -> None:
             group[f"dim{k + 1}"] = np.arange(n)
 
 
+def turned(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        group = file.create_group("entry/data")
+        group.attrs.update({"NX_class": "NXdata", "signal": "counts"})
+        group.attrs["axes"] = ["y", "x", "time"]
+        group.create_dataset("counts", data=FRAMES.transpose(1, 2, 0), chunks=(40, 36, 1))
+        group["time"] = np.arange(5.0)
+        group["time"].attrs["units"] = "s"
+
+
+def master(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["frame_time"], detector["pixel_mask"] = 0.5, np.eye(40, 36, dtype="u4")
+        for k in (1, 2):
+            part = FRAMES[3 * k - 3 : 3 * k]
+            file.create_dataset(f"entry/data/data_{k:06d}", data=part, chunks=(1, 40, 36), **hdf5plugin.Bitshuffle())
+
+
 def hyperspy(path: Path) -> None:
     with h5py.File(path, "w") as file:
         group = file.create_group("Experiments/x")
@@ -126,6 +147,10 @@ BASES: dict[str, Callable[[Path], object]] = {
     "links.h5": links,
     "emd.h5": emd,
     "movie.hspy": hyperspy,
+    "velox.emd": lambda path: velox(path, FRAMES),
+    "turned.nxs": turned,
+    "x_master.h5": master,
+    "movie.zarr": lambda path: small_zarr(path, FRAMES),
     "movie.raw": lambda path: path.write_bytes(FRAMES.tobytes()),
 }
 HOSTILE = (0, 1, 2, 3, 7, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1)

@@ -212,14 +212,14 @@ def chunks_of(dataset: Any, where: str) -> Chunks:
     return Chunks(dataset.shape, dataset.chunks, numbers, offsets, sizes, plain.astype(bool))
 
 
-def decode(data: NDArray[np.uint8], itemsize: int, codec: int, target: NDArray[np.uint8]) -> None:
+def decode(data: Any, itemsize: int, codec: int, target: NDArray[np.uint8]) -> None:
     """Decode a chunk as the bitshuffle filter writes it.
 
     Parameters
     ----------
     data
-        Eight bytes: the number of bytes, four: those of a block (both big-endian); then the blocks, each after its own
-        length; then the pixels that fill no eighth of a block, as they are.
+        (bytes,) uint8. Eight bytes: the number of bytes; four: those of a block (both big-endian). Then the
+        blocks, each after its length; then the pixels that fill no eighth of a block, as they are.
     target
         (bytes,) as many as the chunk has.
 
@@ -228,13 +228,13 @@ def decode(data: NDArray[np.uint8], itemsize: int, codec: int, target: NDArray[n
     ValueError
         Where the chunk is damaged.
     """
-    view = memoryview(data)
+    view: Any = memoryview(data)
     total, block = int.from_bytes(view[:8], "big"), int.from_bytes(view[8:12], "big") or _DEFAULT_BLOCK
     whole = len(target) - len(target) % (8 * itemsize)
     if total != len(target) or block % (8 * itemsize):
         raise ValueError(f"a chunk of {len(target):,} bytes says that it has {total:,}, in blocks of {block:,}")
-    shuffled = np.empty(whole, np.uint8)
-    unpack = imagecodecs.lz4_decode if codec == _LZ4 else imagecodecs.zstd_decode
+    shuffled: Any = np.empty(whole, np.uint8)
+    unpack: Any = imagecodecs.lz4_decode if codec == _LZ4 else imagecodecs.zstd_decode
     at = 12
     for done in range(0, whole, block):
         expected, length = min(block, whole - done), int.from_bytes(view[at : at + 4], "big")
@@ -246,6 +246,6 @@ def decode(data: NDArray[np.uint8], itemsize: int, codec: int, target: NDArray[n
     if len(view) - at < len(target) - whole:
         raise ValueError("a chunk ends too early")
     if whole:
-        blocks = memoryview(shuffled)  # of an array imagecodecs would take the item's size for that of the pixels
+        blocks: Any = memoryview(shuffled)  # of an array imagecodecs would take the item's size for that of the pixels
         imagecodecs.bitshuffle_decode(blocks, itemsize=itemsize, blocksize=block // itemsize, out=target[:whole])
     target[whole:] = data[at : at + len(target) - whole]

@@ -216,7 +216,7 @@ def _check_plain_order(order: Order, where: str) -> None:
 
 def _pixels_of(dataset: Any, where: str) -> np.dtype[Any]:
     """Return the type in which pixels are read; colours and complex numbers are refused by name."""
-    names = dataset.dtype.names or ()
+    names: tuple[str, ...] = tuple(dataset.dtype.names or ())
     if {"r", "g", "b"} <= {name.lower() for name in names}:
         what, remedy = "RGB colours", "Save one colour, or the grey values, as an array of numbers"
     elif len(names) == 2 and names[0].lower().startswith("re") and names[1].lower().startswith("im"):
@@ -284,5 +284,5 @@ def _metadata(file: Any, dataset: Any, axes: list[Axis], order: Order, where: st
     for item in (file, dataset.file, dataset.parent, dataset):
         found = declared({name: single(item, name) for name in item.attrs if name.startswith(DECLARED)})
         pixel, seconds = found[0] or pixel, found[1] or seconds
-    scaled = packing(*(as_number(single(dataset, name)) for name in ("scale_factor", "add_offset")), where)
+    scaled = packing(as_number(single(dataset, "scale_factor")), as_number(single(dataset, "add_offset")), where)
     return replace(said, pixel_size_pm=pixel, frame_time_s=seconds, notes=said.notes + scaled)

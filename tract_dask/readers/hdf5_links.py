@@ -20,6 +20,7 @@ import h5py
 from ..errors import MissingSourceError, SourceError
 from .candidates import Found
 from .hdf5_axes import DAMAGE, is_signal
+from .hdf5_heaps import check_heaps
 from .hdf5_storage import unwritten
 from .source import MOST_FRAMES, Permit, checked_file, reading, truncated, words
 from .velox import detector_of, is_velox
@@ -63,7 +64,7 @@ class Search:
 @contextmanager
 def opened(path: Path, access: Access) -> Iterator[Any]:
     """Open an HDF5 file once it is permitted and known to be a file."""
-    access.check(path)
+    check_heaps(path, access.check(path).st_size)
     with reading(
         str(path),
         "the file cannot be opened as HDF5",

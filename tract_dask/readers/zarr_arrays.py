@@ -189,8 +189,8 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
         found = {} if one is None else one.attributes
         pixel, seconds = declared({name: value for name, value in found.items() if name.startswith(DECLARED)})
         said = replace(said, pixel_size_pm=pixel or said.pixel_size_pm, frame_time_s=seconds or said.frame_time_s)
-    factors = (as_number(node.attributes.get(name, math.nan)) for name in ("scale_factor", "add_offset"))
-    said = replace(said, notes=said.notes + packing(*factors, path.name))
+    factor, offset = (as_number(node.attributes.get(name, math.nan)) for name in ("scale_factor", "add_offset"))
+    said = replace(said, notes=said.notes + packing(factor, offset, path.name))
     store = (above.attributes if above else {}).get("tract_dask")
     if not isinstance(store, dict) or store.get("kind") != "movie":
         return said
