@@ -143,7 +143,8 @@ def zipped(folder: Path, path: Path) -> Path:
 
 
 def small_zarr(path: Path, frames: np.ndarray = FRAMES) -> None:
-    """A zipped store in one file, uncompressed."""
+    """A zipped store in one file, uncompressed; a curve lies before the movie."""
     root = zarr.open_group(zarr.storage.ZipStore(path, mode="w"), mode="w", zarr_format=2)
+    array(root.store, "curve", np.arange(600.0), (600,), zarr_format=2, compressors=None)
     array(root.store, "data", frames, zarr_format=2, compressors=None)
     root.store.close()
