@@ -165,6 +165,18 @@ def test_chunks_that_are_missing(version: int, tmp_path: Path) -> None:
         open_source(path)
 
 
+@pytest.mark.parametrize("location", ["start", "end"])
+def test_chunks_that_are_missing_inside_shards(location: str, tmp_path: Path) -> None:
+    frames = np.where(np.arange(5)[:, None, None] < 3, FRAMES + 1, 0)
+    codecs = zarr.codecs.ShardingCodec(chunk_shape=(1, 20, 16), index_location=location)
+    found = zarr.create(frames.shape, store=str(tmp_path / "a.zarr"), dtype="u2", chunks=(4, 40, 48), codecs=[codecs])
+    found[:4] = frames[:4]
+    found[4, 39, 35] = 1
+    source = open_source(tmp_path / "a.zarr")
+    assert "11 of 30 chunks are missing in its shards; they are read as 0" in source.metadata.notes[0]
+    np.testing.assert_array_equal(source.read(0, 4), frames[:4])
+
+
 def test_a_change_between_opening_and_reading(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
     plain(path)

@@ -29,6 +29,7 @@ from .source import (
 )
 from .zarr_nodes import Node, arrays_below, axes_of, node_at, open_node
 from .zarr_place import Place, open_place, plain_path
+from .zarr_shards import missing_in_shards
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,6 +98,8 @@ def open_zarr(path: Path, inner: str, settings: SourceSettings, permit: Permit |
         metadata = _ours(place, node, calibrated(axes, order, where), path)
         chunks = place.files([f"{node.name}/{name}".strip("/") for name in names])
         missing = _missing(node, len(names), array.fill_value, where)
+        if not missing and node.index is not None and chunks:
+            missing = _missing_inside(node, dict(zip(names, chunks, strict=True)), array.fill_value, where)
         return ZarrSource(
             path=str(path),
             files=(*place.used, *chunks),
@@ -170,6 +173,19 @@ def _missing(node: Node, written: int, fill: Any, where: str) -> tuple[str, ...]
     if written >= expected:
         return ()
     return (f"{where}: {expected - written:,} of {expected:,} chunks are not there; they are read as {fill}",)
+
+
+def _missing_inside(node: Node, files: dict[str, Path], fill: Any, where: str) -> tuple[str, ...]:
+    """Return a note where chunks are missing inside shards."""
+    assert node.shape is not None
+    assert node.index is not None
+    pattern = re.compile(node.keys)
+    matched = ((pattern.fullmatch(name), file) for name, file in files.items())
+    placed = ((tuple(map(int, match.groups())), file) for match, file in matched if match)
+    missing, expected = missing_in_shards(node.index, node.shape, node.chunk, placed)
+    if not missing:
+        return ()
+    return (f"{where}: {missing:,} of {expected:,} chunks are missing in its shards; they are read as {fill}",)
 
 
 def _doubts(node: Node, order: Order) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from .axes import Axis, as_number, evenly
 from .candidates import Found
 from .source import words
 from .zarr_place import Place, plain_path
+from .zarr_shards import ShardIndex, shard_index
 
 _MOST_NODES, _MOST_VALUES = 10_000, 1 << 22
 
@@ -58,6 +59,8 @@ class Node:
         Pattern of the paths of its chunks' files.
     codecs
         Names of what its chunks went through.
+    index
+        Of its shards; None where there are none, or theirs cannot be read here.
     """
 
     name: str
@@ -68,6 +71,7 @@ class Node:
     names: tuple[str, ...] = ()
     keys: str = ""
     codecs: tuple[str, ...] = ()
+    index: ShardIndex | None = None
 
 
 def node_at(place: Place, name: str) -> Node | None:
@@ -105,6 +109,7 @@ def _array_of_3(name: str, attributes: dict[str, Any], found: dict[str, Any]) ->
         tuple(item if isinstance(item, str) else "" for item in found.get("dimension_names") or ()),
         ("" if plain else f"c{sign}") + sign.join([r"(\d+)"] * len(shape)),
         tuple(str(codec.get("name")) for codec in (*codecs, *(one for one in inner if isinstance(one, dict)))),
+        shard_index(codecs),
     )
 
 
