@@ -108,6 +108,31 @@ def test_the_movie_is_turned_as_its_axes_say(name: str, tmp_path: Path) -> None:
     assert (source.metadata.pixel_size_pm, source.metadata.frame_time_s) == (pixel, seconds)
 
 
+@pytest.mark.parametrize("how", ["soft", "relative", "external"])
+def test_axes_of_a_group_that_links_to_the_movie(how: str, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "part.h5", "w") as other, h5py.File(tmp_path / "a.nxs", "w") as file:
+        holder = other if how == "external" else file
+        holder["entry/instrument/detector/data"] = LAST
+        file["entry/instrument/clock"] = step(5, 0.5)
+        file["entry/instrument/clock"].attrs["units"] = "s"
+        group = file.create_group("entry/data")
+        group.attrs.update({"NX_class": "NXdata", "signal": "data", "axes": ["y", "x", "time"]})
+        path = "/entry/instrument/detector/data"
+        group["time"] = h5py.SoftLink("/entry/instrument/clock")
+        if how == "external":
+            group["data"] = h5py.ExternalLink("part.h5", path)
+        else:
+            group["data"] = h5py.SoftLink(path)
+        if how == "relative":
+            del group["data"]
+            file.move(path, "/entry/data/own/data")
+            group["data"] = h5py.SoftLink("own/data")
+    for name in ("a.nxs", "a.nxs::/entry/data/data", "a.nxs::/entry/data"):
+        source = open_source(f"{tmp_path}/{name}")
+        same(source)
+        assert source.metadata.frame_time_s == 0.5
+
+
 def test_times_of_an_axis_with_lost_frames(tmp_path: Path) -> None:
     times = np.array([7.0, 7.5, 8.0, 9.5, 10.0])
     found = open_source(nexus(tmp_path / "a.nxs", FRAMES, ["t", "y", "x"], t=(times, "s"))).metadata

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .axes import as_number
+from .calibration import as_number
 from .hdf5_axes import DAMAGE, single, text, within
 from .source import SourceMetadata
 from .units import to_seconds

@@ -12,12 +12,13 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings.run import SourceSettings
-from .axes import DECLARED, Axis, Order, as_number, calibrated, declared, ordered, packing
+from .axes import Axis, Order, ordered
 from .bitshuffled import FILTER, BitshuffledSource, chunks_of, codec_of
 from .blocks import fill_from
+from .calibration import DECLARED, as_number, calibrated, declared, packing
 from .candidates import ambiguous, movies_of
 from .dectris import master_metadata, parts_of
-from .hdf5_axes import DAMAGE, axes_of, single
+from .hdf5_axes import DAMAGE, axes_of, single, text
 from .hdf5_links import Access, Behind, Segment, files_behind, follow, movies_below, opened
 from .hdf5_storage import check_storage
 from .joined import JoinedSource, check_alike
@@ -164,7 +165,7 @@ def _one(file: Any, path: Path, shown: str, notes: tuple[str, ...], access: Acce
         _check_filters(dataset, where, spared=codec is not None)
         behind = files_behind(dataset, access)
         files = tuple(access.files)
-        axes, unread = axes_of(dataset, where)
+        axes, unread = axes_of(dataset, where, file)
         order = ordered(axes, dataset.shape or (), where)
         shape = order.shape(dataset.shape)
         raw_bytes = sum(part.n_bytes for part in behind.raw)
@@ -246,6 +247,9 @@ def _chosen(file: Any, inner: str, path: Path, access: Access) -> tuple[str, tup
         target = follow(file, inner, access, stack)
         if isinstance(target, h5py.Dataset):
             return inner, ()
+        signal = f"{inner}/{text(single(target, 'signal'))}" if inner and target is not None else ""
+        if signal.rstrip("/") != inner and isinstance(follow(file, signal, access, stack), h5py.Dataset):
+            return signal, ()
         search = movies_below(target, inner, access) if target is not None else movies_below(file, "", access)
     movies = [] if target is None else movies_of(search.found)
     if len(movies) == 1:

@@ -4,29 +4,37 @@ from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Callable
+from functools import partial
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .axes import Axis, as_number, evenly
+from .axes import Axis, evenly
+from .calibration import as_number
 from .source import words
 
 VELOX = re.compile(r"/Data/Image/[^/]+/Data")
 """The path of the images of a Velox file."""
 
-_MOST_VALUES = 1 << 22
+_MOST_VALUES, _MOST_GROUPS, _DEEPEST = 1 << 22, 2000, 16
 
 DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
 """What h5py raises on damaged objects."""
 
 
-def axes_of(dataset: Any, where: str) -> tuple[list[Axis], tuple[str, ...]]:
-    """Return what the file says of each axis of a data set; nothing, and a note, where that is damaged."""
+def axes_of(dataset: Any, where: str, file: Any) -> tuple[list[Axis], tuple[str, ...]]:
+    """Return what a file says of each axis of a data set; nothing, and a note, where that is damaged.
+
+    ``file`` is that which the user named: groups of it may link to the data set, and name its axes.
+    """
     try:
-        for known in (_velox, _hyperspy, _emd, _nexus, _scales):
+        for known in (_velox, _hyperspy, _emd, _nexus, partial(_linked, file=file), _scales):
             if axes := known(dataset):
                 return axes, ()
     except DAMAGE as error:
@@ -48,11 +56,20 @@ def text(value: Any) -> str:
 
 
 def within(group: Any, name: str, kind: type) -> Any:
-    """Return a member that lies in the group itself; None where it is not there: no link is followed for a unit."""
-    if not isinstance(group, h5py.Group) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        return None
-    item = group[name]
+    """Return a member that lies in the same file; None where it is not there: no other file is opened for a unit."""
+    item = _member(group, name)
+    link = None if item is not None or not isinstance(group, h5py.Group) else group.get(name, getlink=True)
+    if isinstance(link, h5py.SoftLink):
+        item = group.file["/"] if link.path.startswith("/") else group
+        for part in filter(None, link.path.split("/")):
+            item = _member(item, part)
     return item if isinstance(item, kind) else None
+
+
+def _member(group: Any, name: str) -> Any:
+    """Return a member that is no link; None where there is none."""
+    there = isinstance(group, h5py.Group) and isinstance(group.get(name, getlink=True), h5py.HardLink)
+    return group[name] if there else None
 
 
 def numbers_of(dataset: Any) -> NDArray[np.float64] | None:
@@ -110,16 +127,46 @@ def _listed(item: Any, name: str) -> Axis:
 
 
 def _nexus(dataset: Any) -> list[Axis]:
-    group = dataset.parent
-    short = (dataset.name or "").rpartition("/")[2]
-    named = group.attrs if text(single(group, "signal")) == short and "axes" in group.attrs else dataset.attrs
-    if "axes" not in named:
+    group, short = dataset.parent, (dataset.name or "").rpartition("/")[2]
+    is_signal = text(single(group, "signal")) == short and "axes" in group.attrs
+    return _by_nexus(dataset, group, group if is_signal else dataset)
+
+
+def _by_nexus(dataset: Any, group: Any, holder: Any) -> list[Axis]:
+    """Return the axes that an attribute of ``holder`` names, and a group has."""
+    if "axes" not in holder.attrs:
         return []
-    names = [text(name) for name in np.atleast_1d(named["axes"])]
+    names = [text(name) for name in np.atleast_1d(holder.attrs["axes"])]
     if len(names) == 1:
         names = [name for name in re.split(r"[\s:,\[\]]+", names[0]) if name]
     places = {_place(group, name, k): name for k, name in enumerate(names)}
     return [_nexus_axis(group, places.get(k, ".")) for k in range(dataset.ndim)]
+
+
+def _linked(dataset: Any, file: Any) -> list[Axis]:
+    """Return the axes by a group of NeXus whose signal is a link to the data set."""
+    waiting, looked = deque([file["/"]]), 0
+    while waiting and looked < _MOST_GROUPS:
+        group = waiting.popleft()
+        signal = text(single(group, "signal"))
+        if signal and _leads_to(group, signal, dataset):
+            return _by_nexus(dataset, group, group)
+        for name in islice(group, _MOST_GROUPS):
+            looked += 1
+            if isinstance(item := _member(group, name), h5py.Group) and item.name.count("/") < _DEEPEST:
+                waiting.append(item)
+    return []
+
+
+def _leads_to(group: Any, name: str, dataset: Any) -> bool:
+    """Tell whether a member of a group is a link to a data set, by its text alone."""
+    link = group.get(name, getlink=True)
+    if not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+        return False
+    other = isinstance(link, h5py.ExternalLink)
+    path = link.path if other or link.path.startswith("/") else f"{group.name}/{link.path}"
+    holder = Path(link.filename if other else group.file.filename).name
+    return (path.strip("/"), holder) == (dataset.name.strip("/"), Path(dataset.file.filename).name)
 
 
 def _place(group: Any, name: str, usual: int) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .axes import as_number
+from .calibration import as_number
 from .hdf5_axes import VELOX, text, within
 from .source import FrameValues, SourceMetadata
 from .units import square_pixel, to_pm, to_seconds

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..errors import SourceError
 from ..settings.run import SourceSettings
-from .axes import DECLARED, Order, as_number, calibrated, declared, ordered, packing
+from .axes import Order, ordered
+from .calibration import DECLARED, as_number, calibrated, declared, packing
 from .candidates import ambiguous, movies_of
 from .source import (
     Frames,

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from .axes import Axis, as_number, evenly
+from .axes import Axis, evenly
+from .calibration import as_number
 from .candidates import Found
 from .source import words
 from .zarr_place import Place, plain_path
