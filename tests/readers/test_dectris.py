@@ -31,7 +31,9 @@ def test_data_files_are_one_movie(tmp_path: Path) -> None:
     found = open_source(master).metadata
     assert (found.frame_time_s, found.pixel_size_pm) == (0.002, None)
     assert found.references["defects"] == Path(f"{master}::/entry/instrument/detector/pixel_mask")
-    assert ["masks 3 pixels" in note for note in found.notes] == [True]
+    untested, masked = found.notes
+    assert "was not tested with a file from a camera" in untested
+    assert "masks 3 pixels" in masked
     assert open_source(str(found.references["defects"])).read(0, 1).sum() == 3
     part = open_source(f"{master}::/entry/data/data_000002")
     np.testing.assert_array_equal(part.read(0, 2), FRAMES[2:4])
@@ -43,7 +45,7 @@ def test_missing_parts_and_frames(tmp_path: Path) -> None:
         del file["entry/data/data_000002"]
     notes = open_source(master).metadata.notes
     assert "part data_000002 is missing" in notes[0]
-    assert "was to take 5 frames, and 3 are there" in notes[1]
+    assert "was to take 5 frames, and 3 are there" in notes[2]
     (tmp_path / "run_data_000003.h5").unlink()
     with pytest.raises(SourceError, match=r"run_data_000003.h5.*no such file"):
         open_source(master)

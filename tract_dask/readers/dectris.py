@@ -13,7 +13,7 @@ import numpy as np
 
 from .calibration import as_number
 from .hdf5_axes import DAMAGE, single, text, within
-from .source import SourceMetadata
+from .source import SourceMetadata, untested
 from .units import to_seconds
 
 _PART = re.compile(r"data_\d{6}")
@@ -42,7 +42,7 @@ def master_metadata(file: Any, names: list[str], n_frames: int, path: Path) -> S
 
     The pixel size of the file is that of the detector, not that of the specimen: it is not used.
     """
-    notes = _gaps(names, path.name)
+    notes = (*_gaps(names, path.name), untested("DECTRIS master files", path.name))
     try:
         detector = _detector(file)
         if detector is None:

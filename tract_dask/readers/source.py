@@ -413,6 +413,14 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
+def untested(name: str, where: str) -> str:
+    """Return the note for a format that was never tested with a camera's file."""
+    return (
+        f"{where}: this reader of {name} was not tested with a file from a camera; compare a frame with the vendor's"
+        " program"
+    )
+
+
 def truncated(where: str, place: str, expected: int, got: int) -> SourceError:
     """Return the error for a file that ends too early; ``expected`` and ``got`` are in bytes."""
     return SourceError(

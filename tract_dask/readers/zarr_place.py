@@ -69,20 +69,19 @@ class Place:
 
     def sizes(self, name: str, depth: int) -> Iterator[tuple[str, int]]:
         """Yield path and bytes of every file below a folder of the store, at most so many folders deep."""
-        top = self.root / name
-        waiting = [(top, "", 0)]
+        top = str(self.root / name)
+        waiting = [(top, os.path.realpath(top), "", 0)]
         while waiting:
-            folder, shown, level = waiting.pop()
-            real = Path(os.path.realpath(folder))
+            folder, real, shown, level = waiting.pop()
             with os.scandir(folder) as found:
                 for item in found:
+                    place = os.path.realpath(item.path) if item.is_symlink() else f"{real}/{item.name}"
                     if self.permit is not None:
-                        self.permit(Path(os.path.realpath(item.path)) if item.is_symlink() else real / item.name)
-                    if item.is_dir():
-                        if level < depth:
-                            waiting.append((Path(item.path), f"{shown}{item.name}/", level + 1))
-                    else:
+                        self.permit(Path(place))
+                    if not item.is_dir():
                         yield f"{shown}{item.name}", item.stat().st_size
+                    elif level < depth:
+                        waiting.append((item.path, place, f"{shown}{item.name}/", level + 1))
 
     def files(self, names: list[str]) -> tuple[Path, ...]:
         """Return the files with these paths, of which the frames come."""
