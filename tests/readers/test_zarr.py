@@ -177,6 +177,19 @@ def test_chunks_that_are_missing_inside_shards(location: str, tmp_path: Path) ->
     np.testing.assert_array_equal(source.read(0, 4), frames[:4])
 
 
+@pytest.mark.parametrize("shards", [None, (2, 40, 36)])
+def test_damaged_heads_of_blosc_do_not_end_the_process(shards: Any, tmp_path: Path) -> None:
+    plain(tmp_path / "a.zarr", shards=shards, compressors=zarr.codecs.BloscCodec(cname="lz4"))
+    source = open_source(tmp_path / "a.zarr")
+    same(source)
+    path = source.files[source.files_of(0, 1)][0]
+    whole = path.read_bytes()
+    for at, said in ((12, 185140684), (12, 20), (4, 0x7FFFFFFF)):
+        path.write_bytes(whole[:at] + said.to_bytes(4, "little") + whole[at + 4 :])
+        with pytest.raises(SourceError, match="its head says other lengths"):
+            source.read(0, 1)
+
+
 def test_a_change_between_opening_and_reading(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
     plain(path)

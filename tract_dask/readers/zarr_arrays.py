@@ -28,6 +28,7 @@ from .source import (
     truncated,
     widened,
 )
+from .zarr_blosc import check_blosc
 from .zarr_nodes import Node, arrays_below, axes_of, node_at, open_node
 from .zarr_place import Place, open_place, plain_path
 from .zarr_shards import missing_in_shards
@@ -67,12 +68,23 @@ class ZarrSource(Source):
     def _read(self, start: int, stop: int) -> Frames:
         for file in self.files[self.files_of(start, stop)]:
             checked_file(file)  # Zarr reads a chunk that is gone as the fill value
+        self._check_blosc(start, stop)
         array = open_node(self.place, self.node)
         if array.shape != self.node.shape:
             return np.empty((0, *self.shape[1:]), self.dtype)  # it has changed
         taken = np.asarray(array[self.order.selection(array.ndim, start, stop)])
         movie = self.order.movie(taken)
         return widened(movie[start:stop] if self.order.frame is None else movie, self.dtype)
+
+    def _check_blosc(self, start: int, stop: int) -> None:
+        """Check the chunks of frames that Blosc is to decode; those of a ZIP file have checksums."""
+        if "blosc" not in self.node.codecs or not len(self.firsts):
+            return
+        index = self.node.index
+        inner = self.node.chunk if index is None else index.chunk
+        n_inner = math.prod(self.node.chunk) // math.prod(inner)
+        chunk_bytes = math.prod(inner) * self.node.dtype.itemsize
+        check_blosc(self.files[self.files_of(start, stop)], chunk_bytes, index, n_inner)
 
 
 def open_zarr(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:

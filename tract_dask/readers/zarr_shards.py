@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 _MOST_SHARDS = 10_000
-_NOWHERE = np.iinfo(np.uint64).max
+_NOWHERE = int(np.iinfo(np.uint64).max)
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,23 @@ def missing_in_shards(
     return missing, expected
 
 
-def _written(file: Path, n_chunks: int, index: ShardIndex) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def places_in_shard(file: Path, n_chunks: int, index: ShardIndex) -> list[tuple[int, int]]:
+    """Return offset and bytes of the chunks that are written in a shard."""
+    found = _index_of(file, n_chunks, index)
+    return [(int(offset), int(length)) for offset, length in found.tolist() if (offset, length) != (_NOWHERE, _NOWHERE)]
+
+
+def _written(file: Path, n_chunks: int, index: ShardIndex) -> NDArray[np.bool_]:
     """Return whether each chunk of a shard is written."""
+    return np.asarray((_index_of(file, n_chunks, index) != _NOWHERE).any(axis=1))
+
+
+def _index_of(file: Path, n_chunks: int, index: ShardIndex) -> NDArray[np.uint64]:
+    """Return (chunks, 2) offset and bytes of each chunk of a shard."""
     n_bytes = 16 * n_chunks
     if file.stat().st_size < n_bytes + index.n_checksum:
         raise ValueError(f"the shard {file.name} is shorter than its index")
     with file.open("rb") as opened:
         if index.at_end:
             opened.seek(-n_bytes - index.n_checksum, 2)
-        found = np.frombuffer(opened.read(n_bytes), "<u8").reshape(n_chunks, 2)
-    return np.asarray((found != _NOWHERE).any(axis=1))
+        return np.frombuffer(opened.read(n_bytes), "<u8").reshape(n_chunks, 2)
