@@ -10,12 +10,14 @@ from pathlib import Path
 
 import files_classic
 import h5py
+import hdf5plugin
 import mrcfile
 import numpy as np
 import pytest
 import tifffile
 from files_classic import eer, fei_records, mrc_4bit, stk
 from files_dm import write_director, write_dm
+from files_hdf5 import small_zarr, velox
 from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
@@ -99,6 +101,25 @@ def emd(path: Path) -> None:
             group[f"dim{k + 1}"] = np.arange(n)
 
 
+def turned(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        group = file.create_group("entry/data")
+        group.attrs.update({"NX_class": "NXdata", "signal": "counts"})
+        group.attrs["axes"] = ["y", "x", "time"]
+        group.create_dataset("counts", data=FRAMES.transpose(1, 2, 0), chunks=(40, 36, 1))
+        group["time"] = np.arange(5.0)
+        group["time"].attrs["units"] = "s"
+
+
+def master(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["frame_time"], detector["pixel_mask"] = 0.5, np.eye(40, 36, dtype="u4")
+        for k in (1, 2):
+            part = FRAMES[3 * k - 3 : 3 * k]
+            file.create_dataset(f"entry/data/data_{k:06d}", data=part, chunks=(1, 40, 36), **hdf5plugin.Bitshuffle())
+
+
 def hyperspy(path: Path) -> None:
     with h5py.File(path, "w") as file:
         group = file.create_group("Experiments/x")
@@ -159,6 +180,10 @@ BASES: dict[str, Callable[[Path], object]] = {
     "stack.dm5": lambda path: write_dm(path, FRAMES, LENGTHS),
     "director.dm4": lambda path: write_director(path, FRAMES, (5000, 9000)),
     "director.dm5": lambda path: write_director(path, FRAMES, (5000, 9000)),
+    "velox.emd": lambda path: velox(path, FRAMES),
+    "turned.nxs": turned,
+    "x_master.h5": master,
+    "movie.zarr": lambda path: small_zarr(path, FRAMES),
     "movie.raw": lambda path: path.write_bytes(FRAMES.tobytes()),
     "small.ser": lambda path: write_ser(path, FRAMES, planned=7),
     "large.ser": lambda path: write_ser(path, FRAMES, version=0x0220, axes=[(5, 0.5, "Time", "s")]),

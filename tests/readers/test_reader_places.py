@@ -16,6 +16,7 @@ import pytest
 import tifffile
 from files_classic import eer
 from files_dm import write_dm
+from files_hdf5 import small_zarr
 from files_stamped import write_mib, write_seq, write_ser, write_tvips
 from files_video import write_video
 
@@ -53,9 +54,11 @@ def write(path: Path) -> Path:
         np.save(path, FRAMES)
     elif suffix in (".avi", ".mp4", ".mov"):
         write_video(path, FRAMES.astype("u1"), "png")
-    elif suffix in (".h5", ".hdf5", ".hspy"):
+    elif suffix in (".h5", ".hdf5", ".hspy", ".emd", ".nxs"):
         with h5py.File(path, "w") as file:
             file["data"] = FRAMES
+    elif suffix in (".zarr", ".zspy"):
+        small_zarr(path, FRAMES)
     elif suffix in (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"):
         header = np.zeros(256, "<i4")
         header[:4] = *FRAMES.shape[::-1], 6

@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+import zarr
 
 from tests.helpers.files_dm import write_seconds
 from tract_dask.errors import InputError, MissingStoreError
@@ -321,6 +322,22 @@ def test_only_a_page_s_entries_are_looked_at(tmp_path, monkeypatch):
 def test_a_page_that_is_none_is_refused(tmp_path, after):
     with pytest.raises(InputError, match="no such page"):
         DataRoot(tmp_path).listing("", after)
+
+
+@pytest.mark.parametrize("name", ["a.zarr", "a.zspy", "plain folder"])
+def test_a_zarr_store_of_others_is_a_movie(name, tmp_path):
+    frames = np.arange(24, dtype="u2").reshape(2, 3, 4)
+    zarr.create_array(tmp_path / name, data=frames, chunks=(1, 3, 4))
+    data = DataRoot(tmp_path)
+    (entry,) = data.listing().entries
+    assert entry.kind == ("folder" if name == "plain folder" else "movie")
+    place = data.source(name)
+    assert place == str(data.path / name)
+    np.testing.assert_array_equal(open_source(place, permit=data.permit).read(0, 2), frames)
+    (tmp_path / name / "c/1/0/0").unlink()
+    (tmp_path / name / "c/1/0/0").symlink_to("/etc/hostname")
+    with pytest.raises(OutsideError):
+        data.source(name)
 
 
 def test_names_that_are_not_utf8_are_shown_and_pipes_left_out(tmp_path):

@@ -19,6 +19,7 @@ from pathlib import Path
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
 from . import gatan, video
+from .dectris import is_part
 from .eer import open_eer
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
@@ -34,6 +35,8 @@ from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, r
 from .tia import is_emi, open_tia
 from .tiff import open_tiff
 from .tvips import is_later_part, open_tvips
+from .zarr_arrays import open_zarr
+from .zarr_place import is_zarr
 
 __all__ = [
     "READERS",
@@ -54,7 +57,10 @@ BUILT_IN = (
     Reader("EER", (".eer",), open_eer, inside="how many readouts are summed into a frame"),
     Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc, is_part=belongs_to_seq),
     Reader("NumPy", (".npy",), open_npy),
-    Reader("HDF5", (".h5", ".hdf5", ".hspy"), open_hdf5, inside="the path of a data set"),
+    Reader(
+        "HDF5", (".h5", ".hdf5", ".hspy", ".emd", ".nxs"), open_hdf5, inside="the path of a data set", is_part=is_part
+    ),
+    Reader("Zarr", (".zarr", ".zspy"), open_zarr, inside="the path of an array", is_movie=is_zarr),
     Reader("video", video.SUFFIXES, video.open_video),
     Reader("TIA", (".ser", ".emi"), open_tia, is_part=is_emi),
     Reader("TVIPS", (".tvips",), open_tvips, is_part=is_later_part),

@@ -12,8 +12,8 @@ import numpy as np
 from ..errors import SourceError
 from .dm_image import COLOURS, COMPLEX, TYPES
 from .dm_tags import Array, Tags
-from .hdf5_links import DAMAGE, Access, opened
-from .source import Permit
+from .hdf5_links import Access, opened
+from .source import DAMAGE, Permit
 
 _MOST_TAGS, _DEEPEST, _LONGEST = 50_000, 64, 1 << 16
 

@@ -15,8 +15,18 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .beside import known_beside, merged
-from .source import Frames, Permit, Source, SourceMetadata, checked_claim, checked_dtype, checked_shape, untested
-from .tiff import DAMAGE, undecoded
+from .source import (
+    DAMAGE,
+    Frames,
+    Permit,
+    Source,
+    SourceMetadata,
+    checked_claim,
+    checked_dtype,
+    checked_shape,
+    untested,
+)
+from .tiff import undecoded
 from .tiff_pages import EER_ABOUT, Page, Tags, walk
 from .units import number, square_pixel, to_pm, to_seconds
 

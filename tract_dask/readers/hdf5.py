@@ -1,9 +1,7 @@
-"""HDF5 data sets, named as ``file.h5::/path/in/file``; HyperSpy's .hspy among them."""
+"""HDF5 data sets, named as ``file.h5::/path/in/file``: also those of EMD, HyperSpy, NeXus and DECTRIS."""
 
 from __future__ import annotations
 
-import math
-import re
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,25 +12,29 @@ import numpy as np
 
 from ..errors import SourceError
 from ..settings.run import SourceSettings
+from .axes import Axis, Order, ordered
+from .bitshuffled import FILTER, BitshuffledSource, chunks_of, codec_of
 from .blocks import fill_from
-from .hdf5_links import DAMAGE, Access, Found, Segment, files_behind, follow, movies_below, opened
+from .calibration import DECLARED, as_number, calibrated, declared, packing
+from .candidates import ambiguous, movies_of
+from .dectris import master_metadata, parts_of
+from .hdf5_axes import axes_of, single, text
+from .hdf5_links import Access, Behind, Segment, files_behind, follow, movies_below, opened
+from .hdf5_storage import check_storage
+from .joined import JoinedSource, check_alike
 from .source import (
+    DAMAGE,
+    MOST_FRAMES,
     Frames,
     Permit,
     Source,
     SourceMetadata,
-    checked_claim,
     checked_dtype,
     checked_file,
-    checked_shape,
     reading,
-    truncated,
     widened,
 )
-from .units import square_pixel, to_pm, to_seconds
-
-_CHUNK_BYTES, _CHUNK_RATIO = 32 << 20, 100
-"""A chunk may claim so many bytes, and so many times the bytes of its file."""
+from .velox import is_velox, velox_metadata
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,11 +47,17 @@ class Hdf5Source(Source):
         The file that holds it, behind all links, and its path there.
     sources
         The HDF5 files of a virtual data set, each with the frames that come from it.
+    order
+        Which stored axis is which.
+    depth
+        Frames that are stored together.
     """
 
     holder: Path
     inner: str
     sources: tuple[tuple[Path, range], ...]
+    order: Order
+    depth: int
 
     def _read(self, start: int, stop: int) -> Frames:
         try:
@@ -65,9 +73,21 @@ class Hdf5Source(Source):
                 if start < frames.stop and frames.start < stop:
                     stack.enter_context(h5py.File(source, "r"))
             file = stack.enter_context(h5py.File(self.holder, "r"))
-            dataset = file[self.inner]
-            pixels: Frames = dataset[start:stop] if dataset.ndim == 3 else dataset[()][None][start:stop]
-        return pixels
+            return self._taken(file[self.inner], start, stop)
+
+    def _taken(self, dataset: Any, start: int, stop: int) -> Frames:
+        """Read frames as they lie; where they lie along a later axis, those that are stored together at a time."""
+        if not self.order.frame:
+            taken: Frames = self.order.movie(dataset[self.order.selection(dataset.ndim, start, stop)])
+            return taken[start:stop] if self.order.frame is None else taken
+        frames = np.empty((max(0, stop - start), *self.shape[1:]), dataset.dtype)
+        first = start
+        while first < stop:
+            last = min(stop, first - first % self.depth + self.depth)
+            taken = dataset[self.order.selection(dataset.ndim, first, last)]
+            frames[first - start : last - start] = self.order.movie(taken)
+            first = last
+        return frames
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +114,7 @@ class RawPixelSource(Source):
 
 
 def open_hdf5(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
-    """Open a data set of an HDF5 file; where only one has three axes, ``inner`` may be empty.
+    """Open a data set of an HDF5 file; where only one could be the movie, ``inner`` may be empty, or name a group.
 
     Raises
     ------
@@ -105,29 +125,107 @@ def open_hdf5(path: Path, inner: str, settings: SourceSettings, permit: Permit |
     with reading(str(path), "the file cannot be read as HDF5"), ExitStack() as stack:
         access = Access(permit)
         file = stack.enter_context(opened(path, access))
+        group = follow(file, inner or "/entry/data", Access(permit), stack)
+        if parts := parts_of(file, group):
+            return _joined(file, path, inner, parts, permit)
         shown, notes = _chosen(file, inner, path, Access(permit))
+        return _one(file, path, shown, notes, access)
+
+
+def _joined(file: Any, path: Path, inner: str, names: list[str], permit: Permit | None) -> Source:
+    """Open the parts of a master file as one movie."""
+    inside = f"/{inner.strip('/') or 'entry/data'}"
+    parts = [_one(file, path, f"{inside}/{name}", (), Access(permit, {path: None})) for name in names]
+    check_alike(parts, str(path))
+    firsts = np.cumsum([0, *(part.shape[0] for part in parts)])
+    said = master_metadata(file, names, int(firsts[-1]), path)
+    first = parts[0].metadata
+    notes = tuple(dict.fromkeys((*said.notes, *(note for part in parts for note in part.metadata.notes))))
+    return JoinedSource(
+        path=str(path),
+        files=tuple(dict.fromkeys(used for part in parts for used in part.files)),
+        format="DECTRIS",
+        shape=(int(firsts[-1]), *parts[0].shape[1:]),
+        dtype=parts[0].dtype,
+        metadata=replace(
+            said, pixel_size_pm=first.pixel_size_pm, frame_time_s=said.frame_time_s or first.frame_time_s, notes=notes
+        ),
+        inside=inside,
+        parts=tuple(parts),
+        firsts=firsts,
+    )
+
+
+def _one(file: Any, path: Path, shown: str, notes: tuple[str, ...], access: Access) -> Source:
+    """Open one data set; ``file`` is that which the user named, and ``shown`` the path in it."""
+    with ExitStack() as stack:
         dataset = follow(file, shown, access, stack)
         where = f"{path}::{shown}"
-        dtype = checked_dtype(dataset.dtype, where)
-        _check_filters(dataset, where)
+        dtype = _pixels_of(dataset, where)
+        codec = codec_of(dataset)
+        _check_filters(dataset, where, spared=codec is not None)
         behind = files_behind(dataset, access)
         files = tuple(access.files)
-        shape = checked_shape(dataset.shape or (), where)
-        notes += _check_storage(dataset, shape, where, files, behind.raw)
-        metadata = _calibration(file, dataset, where)
+        axes, unread = axes_of(dataset, where, file)
+        order = ordered(axes, dataset.shape or (), where)
+        shape = order.shape(dataset.shape)
+        raw_bytes = sum(part.n_bytes for part in behind.raw)
+        notes += (*unread, *check_storage(dataset, where, files, raw_bytes), *behind.notes, *_doubts(dataset, order))
+        metadata = _calibration(file, dataset, axes, order, where)
         common: dict[str, Any] = {
             "path": str(path),
             "files": files,
-            "format": "HDF5",
+            "format": "Velox EMD" if is_velox(dataset) else "HDF5",
             "shape": shape,
             "dtype": dtype,
             "metadata": replace(metadata, notes=metadata.notes + notes),
             "inside": dataset.name,
         }
         if dataset.id.get_create_plist().get_external_count():
+            _check_plain_order(order, where)
             return RawPixelSource(**common, segments=tuple(behind.raw), stored=_stored(dataset, where))
-        holder, sources = Path(dataset.file.filename), tuple(behind.hdf5.items())[1:]
-        return Hdf5Source(**common, holder=holder, inner=dataset.name, sources=sources)
+        common |= {"holder": Path(dataset.file.filename), "order": order}
+        if codec is not None:
+            found = chunks_of(dataset, where)
+            fill = dataset.fillvalue
+            return BitshuffledSource(**common, stored=dataset.dtype, chunks=found, codec=codec, fill=fill)
+        depth = dataset.chunks[order.frame] if order.frame and dataset.chunks else 1
+        return Hdf5Source(**common, inner=dataset.name, sources=_sources(behind, order), depth=depth)
+
+
+def _doubts(dataset: Any, order: Order) -> tuple[str, ...]:
+    """Return what was guessed about the axes; chunks of one frame each leave no doubt."""
+    return () if dataset.chunks and dataset.chunks[0] == 1 and dataset.ndim == 3 else order.notes
+
+
+def _sources(behind: Behind, order: Order) -> tuple[tuple[Path, range], ...]:
+    """Return the files of a virtual data set, each with its frames; all, where the frames are not the first axis."""
+    items = tuple(behind.hdf5.items())[1:]
+    return items if order.frame == 0 else tuple((file, range(MOST_FRAMES)) for file, _ in items)
+
+
+def _check_plain_order(order: Order, where: str) -> None:
+    """Refuse raw pixels in other files whose axes are in another order: they are read as they lie."""
+    if order.chosen not in ((0, 1), (0, 1, 2)):
+        raise SourceError(
+            "the raw pixels lie in other files, and their axes are not in the order (frames, y, x)",
+            where,
+            "the axes (frames, y, x)",
+            f"frame, y and x as axes {order.chosen}",
+            "Write the movie again, as an ordinary data set",
+        )
+
+
+def _pixels_of(dataset: Any, where: str) -> np.dtype[Any]:
+    """Return the type in which pixels are read; colours and complex numbers are refused by name."""
+    names: tuple[str, ...] = tuple(dataset.dtype.names or ())
+    if {"r", "g", "b"} <= {name.lower() for name in names}:
+        what, remedy = "RGB colours", "Save one colour, or the grey values, as an array of numbers"
+    elif len(names) == 2 and names[0].lower().startswith("re") and names[1].lower().startswith("im"):
+        what, remedy = "complex numbers", "Convert the movie, for example to its modulus, and save it as float32"
+    else:
+        return checked_dtype(dataset.dtype, where)
+    raise SourceError(f"the pixels are {what}", where, "one number a pixel", str(dataset.dtype), remedy)
 
 
 def _stored(dataset: Any, where: str) -> np.dtype[Any]:
@@ -150,91 +248,23 @@ def _chosen(file: Any, inner: str, path: Path, access: Access) -> tuple[str, tup
         target = follow(file, inner, access, stack)
         if isinstance(target, h5py.Dataset):
             return inner, ()
+        signal = f"{inner}/{text(single(target, 'signal'))}" if inner and target is not None else ""
+        if signal.rstrip("/") != inner and isinstance(follow(file, signal, access, stack), h5py.Dataset):
+            return signal, ()
         search = movies_below(target, inner, access) if target is not None else movies_below(file, "", access)
-    numbers = [] if target is None else [item for item in search.found if item.dtype.kind in "iufcb"]
-    movies = [item for item in numbers if len(item.shape) == 3] or [item for item in numbers if len(item.shape) == 2]
+    movies = [] if target is None else movies_of(search.found)
     if len(movies) == 1:
         lost = f" (and {len(search.lost) - 1} more)" if len(search.lost) > 1 else ""
         return movies[0].shown, (f"{path.name}: {search.lost[0]}{lost}",) if search.lost else ()
-    raise _ambiguous(path, inner, target, movies, movies or search.found, search.lost)
+    raise ambiguous(path, inner, movies, search.found, search.lost, there=target is not None)
 
 
-def _ambiguous(
-    path: Path, inner: str, target: Any, movies: list[Found], found: list[Found], lost: list[str]
-) -> SourceError:
-    listing = ", ".join(f"{item.shown} {item.shape} {item.dtype}" for item in found[:20])
-    holds = f"a file that holds {listing}" if listing else "a file without data sets"
-    return SourceError(
-        "there is nothing under this path"
-        if target is None
-        else f"there are {len(movies) or 'no'} data sets that could be the movie",
-        f"{path}::{inner}" if inner else str(path),
-        "the path of one data set with axes (frames, y, x)",
-        f"{holds}, where {'; '.join(lost[:9])}" if lost else holds,
-        f"Name it, for example {path.name}::{movies[0].shown}" if movies else "Name one of those, or check the file",
-    )
-
-
-def _check_storage(
-    dataset: Any, shape: tuple[int, int, int], where: str, files: tuple[Path, ...], raw: list[Segment]
-) -> tuple[str, ...]:
-    """Check that the pixels are in the file; return a note where some were never written."""
-    size = sum(file.stat().st_size for file in files)
-    checked_claim(shape[1] * shape[2] * dataset.dtype.itemsize, size, where)
+def _check_filters(dataset: Any, where: str, *, spared: bool) -> None:
+    """Refuse filters that HDF5 does not have, but ``spared`` for the one that is decoded here."""
     properties = dataset.id.get_create_plist()
-    layout, n_bytes = properties.get_layout(), math.prod(shape) * dataset.dtype.itemsize
-    if properties.get_external_count():
-        held = sum(part.n_bytes for part in raw)
-        if held < n_bytes:
-            raise truncated(where, "before the last frame of its raw pixels", n_bytes, held)
-    elif layout == h5py.h5d.CONTIGUOUS:
-        offset = dataset.id.get_offset()
-        if offset is None:
-            raise _never_written(where)
-        if offset + n_bytes > size:
-            raise truncated(where, "before the last frame", offset + n_bytes, size)
-    if layout != h5py.h5d.CHUNKED:
-        return ()
-    _check_chunks(dataset, size, where)
-    expected = int(
-        np.prod([-(-n // chunk) for n, chunk in zip(dataset.shape, dataset.chunks, strict=True)], dtype=object)
-    )
-    written = dataset.id.get_num_chunks()
-    if not written:
-        raise _never_written(where)
-    return () if written >= expected else (_PARTLY.format(where, expected - written, expected),)
-
-
-_PARTLY = "{}: {:,} of {:,} chunks were never written; their pixels are read as the fill value"
-
-
-def _check_chunks(dataset: Any, size: int, where: str) -> None:
-    n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    if n_bytes > _CHUNK_BYTES + _CHUNK_RATIO * size:
-        raise SourceError(
-            "one chunk would be far larger than the file can hold",
-            where,
-            f"at most {_CHUNK_BYTES + _CHUNK_RATIO * size:,} bytes from files of {size:,}",
-            f"{n_bytes:,} bytes, chunks {dataset.chunks}",
-            "The file is damaged, or repack it with h5repack -l CHUNK=1x512x512",
-        )
-
-
-def _never_written(where: str) -> SourceError:
-    return SourceError(
-        "no pixel of the data set was ever written",
-        where,
-        "stored frames",
-        "room for them only",
-        "Wait until the movie is written, or name another data set",
-    )
-
-
-def _check_filters(dataset: Any, where: str) -> None:
-    properties = dataset.id.get_create_plist()
-    for number in range(properties.get_nfilters()):
-        code, _, _, name = properties.get_filter(number)
-        if not h5py.h5z.filter_avail(code):
+    for place in range(properties.get_nfilters()):
+        code, _, _, name = properties.get_filter(place)
+        if not (spared and code == FILTER) and not h5py.h5z.filter_avail(code):
             raise SourceError(
                 "the data are compressed by a filter that is not installed",
                 where,
@@ -244,49 +274,20 @@ def _check_filters(dataset: Any, where: str) -> None:
             )
 
 
-def _calibration(file: Any, dataset: Any, where: str) -> SourceMetadata:
+def _calibration(file: Any, dataset: Any, axes: list[Axis], order: Order, where: str) -> SourceMetadata:
     """Return the calibration; none, and a note, where it is damaged: the pixels may be whole."""
     try:
-        return _metadata(file, dataset)
+        return _metadata(file, dataset, axes, order, where)
     except DAMAGE as error:
         return SourceMetadata(notes=(f"{where}: the calibration cannot be read ({' '.join(str(error).split())})",))
 
 
-def _metadata(file: Any, dataset: Any) -> SourceMetadata:
-    """Return the calibration of HyperSpy's axes, or of attributes such as pixel_size_nm and frame_time_ms."""
-    axes = [_axis(dataset.parent, number) for number in range(dataset.ndim)]
-    pixel, notes = square_pixel(to_pm(*axes[-1]), to_pm(*axes[-2]))
-    seconds = to_seconds(*axes[0]) if dataset.ndim == 3 else None
+def _metadata(file: Any, dataset: Any, axes: list[Axis], order: Order, where: str) -> SourceMetadata:
+    """Return the calibration of the axes or of Velox, or of attributes such as pixel_size_nm and frame_time_ms."""
+    said = velox_metadata(dataset, where) if is_velox(dataset) else calibrated(axes, order, where)
+    pixel, seconds = said.pixel_size_pm, said.frame_time_s
     for item in (file, dataset.file, dataset.parent, dataset):
-        for name in item.attrs:
-            if match := re.fullmatch(r"(pixel_size|frame_time)_([^_]+)", name):
-                convert, number = (to_pm if match[1] == "pixel_size" else to_seconds), _number(_single(item, name))
-                if match[1] == "pixel_size":
-                    pixel = convert(number, match[2]) or pixel
-                else:
-                    seconds = convert(number, match[2]) or seconds
-    return SourceMetadata(pixel, seconds, notes=notes)
-
-
-def _axis(group: Any, number: int) -> tuple[float, str]:
-    """Return scale and unit of a HyperSpy axis; the unit is empty where there is no such axis."""
-    name = f"axis-{number}"
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):  # no link is followed for a unit
-        return math.nan, ""
-    axis = group[name]
-    unit = _single(axis, "units")
-    return _number(_single(axis, "scale")), unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
-
-
-def _single(item: Any, name: str) -> Any:
-    """Return an attribute that holds one value; empty where it is not there, or holds many."""
-    if name not in item.attrs or item.attrs.get_id(name).shape not in ((), (1,)):
-        return ""
-    return item.attrs[name]
-
-
-def _number(value: Any) -> float:
-    try:
-        return float(np.asarray(value).item())
-    except (TypeError, ValueError):
-        return float("nan")
+        found = declared({name: single(item, name) for name in item.attrs if name.startswith(DECLARED)})
+        pixel, seconds = found[0] or pixel, found[1] or seconds
+    scaled = packing(as_number(single(dataset, "scale_factor")), as_number(single(dataset, "add_offset")), where)
+    return replace(said, pixel_size_pm=pixel, frame_time_s=seconds, notes=said.notes + scaled)

@@ -16,19 +16,20 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 
 from ..errors import MissingSourceError, SourceError
-from .source import MOST_FRAMES, Permit, checked_file, reading, truncated, words
+from .candidates import Found
+from .hdf5_axes import is_signal
+from .hdf5_heaps import check_heaps
+from .hdf5_storage import unwritten
+from .source import DAMAGE, MOST_FRAMES, Permit, checked_file, reading, truncated, words
+from .velox import detector_of, is_velox
 
 MOST_LINKS = 16
 """So many links may follow each other, as in libhdf5; more are a circle."""
 
 MOST_OBJECTS = 10_000
 """So many groups and data sets are looked at for one that could be the movie."""
-
-DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
-"""What h5py raises on damaged objects."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +51,6 @@ class Access:
             self.permit(Path(os.path.realpath(path)))
 
 
-@dataclass(frozen=True)
-class Found:
-    """A data set: its path as seen from the file that the user named, its axes, and the type of its pixels."""
-
-    shown: str
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-
 @dataclass
 class Search:
     """The movies below a path, and what could not be looked at on the way."""
@@ -72,7 +64,7 @@ class Search:
 @contextmanager
 def opened(path: Path, access: Access) -> Iterator[Any]:
     """Open an HDF5 file once it is permitted and known to be a file."""
-    access.check(path)
+    check_heaps(path, access.check(path).st_size)
     with reading(
         str(path),
         "the file cannot be opened as HDF5",
@@ -160,7 +152,16 @@ def _search_outside(at: Any, name: str, shown: str, access: Access, search: Sear
 
 
 def _found(dataset: Any, shown: str) -> Found:
-    return Found(shown, dataset.shape or (), dataset.dtype)
+    label = _label(dataset) if is_velox(dataset) else ""
+    return Found(shown, dataset.shape or (), dataset.dtype, is_signal(dataset), label)
+
+
+def _label(dataset: Any) -> str:
+    try:
+        name = detector_of(dataset)
+    except DAMAGE:
+        name = ""
+    return f" ({name[:40]})" if name else ""
 
 
 def _names(group: Any, search: Search, path: str) -> list[str]:
@@ -208,10 +209,14 @@ class Segment:
 
 @dataclass(frozen=True)
 class Behind:
-    """The files that pixels come from: of HDF5, each with its frames, that which holds the data set first; and raw."""
+    """The files that pixels come from: of HDF5, each with its frames, that which holds the data set first; and raw.
+
+    ``notes`` say what was never written in the sources of a virtual data set.
+    """
 
     hdf5: dict[Path, range] = field(default_factory=dict)
     raw: list[Segment] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     seen: set[tuple[str, str]] = field(default_factory=set)
 
 
@@ -237,6 +242,7 @@ def _behind(dataset: Any, access: Access, behind: Behind, depth: int, frames: ra
     known = behind.hdf5.get(holder, frames)
     behind.hdf5[holder] = range(min(known.start, frames.start), max(known.stop, frames.stop))
     properties = dataset.id.get_create_plist()
+    behind.notes.extend(unwritten(dataset, f"{holder}::{dataset.name}") if depth else ())
     for number in range(properties.get_external_count()):
         name, offset, size = properties.get_external(number)
         behind.raw.append(_segment(dataset, os.fsdecode(name), offset, size, access, virtual=depth > 0))

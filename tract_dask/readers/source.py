@@ -309,6 +309,9 @@ def checked_shape(shape: tuple[int, ...], where: str) -> tuple[int, int, int]:
     return n_frames, n_y, n_x
 
 
+DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
+"""What libraries raise on damaged files."""
+
 FRAME_BYTES, RATIO = 64 << 20, 1000
 """A frame may claim so many bytes, and so many times the bytes of its file, before it is believed to be damaged."""
 

@@ -16,6 +16,7 @@ from ..settings.run import SourceSettings
 from .beside import known_beside, merged
 from .blocks import BlockSource, flip
 from .source import (
+    DAMAGE,
     Frames,
     Permit,
     Source,
@@ -33,9 +34,6 @@ from .tiff_metadata import Description, parse_description
 from .tiff_pages import ORIENTATION, SUB_PAGES, Page, Tags, walk
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it warns of is an error here, with a remedy
-
-DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, ArithmeticError)
-"""What tifffile and its codecs raise on damaged pages."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -38,6 +38,9 @@ MOST_NAMES = 1_000_000
 MAX_NAME_BYTES = 255
 MAX_PATH_BYTES = 2048
 
+STORES = (".zarr", ".zspy")
+"""Suffixes of folders that are shown as one thing: a movie, or another store."""
+
 _INNER = "::"
 
 
@@ -54,8 +57,9 @@ class Entry:
     name, path
         Its name, and its path relative to the data root, with "/" between.
     kind
-        ``folder``; ``movie`` for what a reader opens by its suffix, and for a store with a movie; ``unusable`` for what
-        has a name that is not UTF-8, and so no path; ``file`` for the rest, other stores (.zarr) among them.
+        ``folder``; ``movie`` for what a reader opens by its suffix, for a store with a movie, and for a Zarr store of
+        others; ``unusable`` for what has a name that is not UTF-8, and so no path; ``file`` for the rest, other stores
+        (.zarr) among them.
     bytes
         Size of a file; None for folders and stores.
     modified
@@ -356,7 +360,7 @@ def _key(item: os.DirEntry[str]) -> _Key:
         is_folder = item.is_dir()
     except OSError:
         is_folder = False
-    return not is_folder or item.name.lower().endswith(".zarr"), item.name.lower(), item.name
+    return not is_folder or item.name.lower().endswith(STORES), item.name.lower(), item.name
 
 
 def _cursor(key: _Key) -> str:
@@ -385,11 +389,12 @@ def _moment(seconds: float) -> str:
 
 
 def _kind(place: Path, is_folder: bool) -> str:
-    if is_folder and place.suffix.lower() != ".zarr":
+    if is_folder and place.suffix.lower() not in STORES:
         return "folder"
     if is_folder:
         try:
-            return "movie" if metadata.attributes(place).get("kind") == "movie" else "file"
+            kind = metadata.attributes(place).get("kind")
+            return "movie" if kind == "movie" or (kind is None and is_movie_folder(place)) else "file"
         except StoreError:  # a damaged store does not keep others from being listed
             return "file"
     return "movie" if place.suffix.lower() in READERS else "file"

@@ -1,0 +1,274 @@
+"""Axes of HDF5 data: taken by their names and units, whatever their order; spectra and the like are refused by name."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from files_hdf5 import FRAMES, emd, hyperspy, nexus, velox
+
+from tract_dask.errors import SourceError
+from tract_dask.readers import FrameSource, open_source
+
+LAST = FRAMES.transpose(1, 2, 0)
+MIRROR = FRAMES.transpose(2, 1, 0)
+Y, X, T = ("y", "nm", 0.02, False), ("x", "nm", 0.02, False), ("time", "ms", 40.0, True)
+
+
+def same(source: FrameSource, frames: np.ndarray = FRAMES) -> None:
+    for found in (source, pickle.loads(pickle.dumps(source))):
+        np.testing.assert_array_equal(found.read(0, len(frames)), frames)
+        np.testing.assert_array_equal(found.read(1, 4), frames[1:4])
+        into = np.empty((2, *frames.shape[1:]), frames.dtype)
+        found.read_into(2, into)
+        np.testing.assert_array_equal(into, frames[2:4])
+
+
+def fails(path: Path | str, *said: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        open_source(path)
+    assert all(part in str(caught.value) for part in said), str(caught.value)
+    assert caught.value.remedy
+
+
+def step(n: int, by: float = 0.02) -> np.ndarray:
+    return np.arange(n) * by
+
+
+def dimension_scales(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        file["frames"] = LAST
+        for k, (name, unit) in enumerate((("y", "nm"), ("x", "nm"), ("time", "s"))):
+            file[name] = step(LAST.shape[k])
+            file[name].attrs["units"] = unit
+            file[name].make_scale()
+            file["frames"].dims[k].attach_scale(file[name])
+    return path
+
+
+def labels(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        file["frames"] = MIRROR
+        for k, name in enumerate(("x", "y", "t")):
+            file["frames"].dims[k].label = name
+    return path
+
+
+WRITERS: dict[str, tuple[Callable[[Path], object], float | None, float | None]] = {
+    "nexus": (
+        lambda path: nexus(path, LAST, ["y", "x", "frame_number"], x=(step(36), "nm"), y=(step(40), "nm")),
+        20.0,
+        None,
+    ),
+    "nexus mirrored": (lambda path: nexus(path, MIRROR, ["x", "y", "time"], time=(step(5, 4), "s")), None, 4.0),
+    "nexus in order": (lambda path: nexus(path, FRAMES, [".", "y", "x"]), None, None),
+    "emd by name": (
+        lambda path: emd(path, MIRROR, [("R_x", "[n_m]", step(36)), ("R_y", "[n_m]", step(40)), ("", "", step(5))]),
+        20.0,
+        None,
+    ),
+    "emd by unit": (
+        lambda path: emd(path, LAST, [("", "[n_m]", step(2)), ("", "[n_m]", step(2)), ("", "[s]", step(2))]),
+        20.0,
+        0.02,
+    ),
+    "emd from zero": (
+        lambda path: emd(path, FRAMES, [("n", "", step(5)), ("y", "nm", step(2)), ("x", b"nm", step(2))], first=0),
+        20.0,
+        None,
+    ),
+    "emd with labels": (
+        lambda path: emd(path, LAST, [("y", "A", step(40)), ("x", "A", step(36)), ("", "", list("abcde"))]),
+        2.0,
+        None,
+    ),
+    "emd of HyperSpy": (lambda path: emd(path, MIRROR, [("", "[]", step(2, 1))] * 3, record_by=""), None, None),
+    "hyperspy": (lambda path: hyperspy(path, FRAMES, [T, Y, X]), 20.0, 0.04),
+    "hyperspy without names": (
+        lambda path: hyperspy(path, FRAMES, [("", "s", 0.5, True), ("", "nm", 0.02, False), ("", "nm", 0.02, False)]),
+        20.0,
+        0.5,
+    ),
+    "scales": (dimension_scales, 20.0, 0.02),
+    "labels": (labels, None, None),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_movie_is_turned_as_its_axes_say(name: str, tmp_path: Path) -> None:
+    write, pixel, seconds = WRITERS[name]
+    write(tmp_path / "a.h5")
+    source = open_source(tmp_path / "a.h5")
+    same(source)
+    assert (source.metadata.pixel_size_pm, source.metadata.frame_time_s) == (pixel, seconds)
+
+
+@pytest.mark.parametrize("how", ["soft", "relative", "external"])
+def test_axes_of_a_group_that_links_to_the_movie(how: str, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "part.h5", "w") as other, h5py.File(tmp_path / "a.nxs", "w") as file:
+        holder = other if how == "external" else file
+        holder["entry/instrument/detector/data"] = LAST
+        file["entry/instrument/clock"] = step(5, 0.5)
+        file["entry/instrument/clock"].attrs["units"] = "s"
+        group = file.create_group("entry/data")
+        group.attrs.update({"NX_class": "NXdata", "signal": "data", "axes": ["y", "x", "time"]})
+        path = "/entry/instrument/detector/data"
+        group["time"] = h5py.SoftLink("/entry/instrument/clock")
+        if how == "external":
+            group["data"] = h5py.ExternalLink("part.h5", path)
+        else:
+            group["data"] = h5py.SoftLink(path)
+        if how == "relative":
+            del group["data"]
+            file.move(path, "/entry/data/own/data")
+            group["data"] = h5py.SoftLink("own/data")
+    for name in ("a.nxs", "a.nxs::/entry/data/data", "a.nxs::/entry/data"):
+        source = open_source(f"{tmp_path}/{name}")
+        same(source)
+        assert source.metadata.frame_time_s == 0.5
+
+
+def test_times_of_an_axis_with_lost_frames(tmp_path: Path) -> None:
+    times = np.array([7.0, 7.5, 8.0, 9.5, 10.0])
+    found = open_source(nexus(tmp_path / "a.nxs", FRAMES, ["t", "y", "x"], t=(times, "s"))).metadata
+    assert found.frame_time_s == 0.5
+    np.testing.assert_array_equal(found.along_frames["time"].values, times - 7)
+    assert "gap of 1.5 s after frame 2" in found.notes[0]
+
+
+REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
+    "spectrum image": (
+        lambda path: hyperspy(path, LAST, [(*Y[:3], True), (*X[:3], True), ("Energy loss", "eV", 1, False)]),
+        ("spectrum image", "Energy loss (eV)"),
+    ),
+    "spectra without names": (
+        lambda path: hyperspy(path, LAST, [("", "", 1, True), ("", "", 1, True), ("", "", 1, False)]),
+        ("spectrum",),
+    ),
+    "line of spectra": (
+        lambda path: hyperspy(path, LAST[0], [("x", "nm", 1, True), ("E", "keV", 1, False)]),
+        ("spectrum", "E (keV)"),
+    ),
+    "four axes": (
+        lambda path: emd(path, np.zeros((2, 3, 4, 5)), [(name, "", step(2)) for name in ("R_x", "R_y", "Q_x", "Q_y")]),
+        ("4 axes", "R_x, R_y, Q_x, Q_y"),
+    ),
+    "channels": (lambda path: nexus(path, FRAMES, ["y", "x", "channel"]), ("colours", "channel")),
+    "profile": (lambda path: nexus(path, FRAMES[0], ["time", "x"]), ("line profile",)),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_movie_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    write, said = REFUSED[name]
+    write(tmp_path / "a.hspy")
+    fails(tmp_path / "a.hspy", *said)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "said"),
+    [
+        ([("r", "u1"), ("g", "u1"), ("b", "u1")], "RGB colours"),
+        ([("realFloat", "<f4"), ("imagFloat", "<f4")], "complex numbers"),
+        ("c8", "complex numbers"),
+    ],
+)
+def test_pixels_that_are_no_numbers_are_refused_by_name(dtype: Any, said: str, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["data"] = np.zeros((3, 4, 5), dtype)
+    fails(f"{tmp_path / 'a.h5'}::/data", said)
+
+
+def test_doubts_where_nothing_names_the_axes(tmp_path: Path) -> None:
+    for name, shape, chunks, doubted in (
+        ("turned", (20, 24, 6), None, True),
+        ("deep", (4096, 16, 16), None, True),
+        ("movie", (100, 64, 64), None, False),
+        ("frames", (100, 20, 24), (1, 20, 24), False),
+    ):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file.create_dataset("data", data=np.ones(shape, "u1"), chunks=chunks)
+        notes = open_source(tmp_path / f"{name}.h5").metadata.notes
+        assert any("nothing in the file names its axes" in note for note in notes) == doubted, name
+
+
+def test_a_unit_that_is_no_length_is_named(tmp_path: Path) -> None:
+    hyperspy(tmp_path / "a.hspy", FRAMES, [T, ("y", "1/nm", 0.1, False), ("x", "1/nm", 0.1, False)])
+    found = open_source(tmp_path / "a.hspy").metadata
+    assert found.pixel_size_pm is None
+    assert "measured in 1/nm" in found.notes[0]
+    hyperspy(tmp_path / "b.hspy", FRAMES, [T, ("y", "", 0.1, False), ("x", "", 0.1, False)])
+    assert "the size 0.1 without a unit" in open_source(tmp_path / "b.hspy").metadata.notes[0]
+
+
+@pytest.mark.parametrize("depth", [1, 3, 5])
+def test_velox(depth: int, tmp_path: Path) -> None:
+    source = open_source(velox(tmp_path / "a.emd", depth=depth))
+    same(source)
+    found = source.metadata
+    assert (source.format, found.pixel_size_pm, found.frame_time_s, found.notes) == ("Velox EMD", 20.0, 0.25, ())
+    np.testing.assert_allclose(found.along_frames["stage_tilt"].values, np.degrees(0.1 * np.arange(5)))
+    np.testing.assert_array_equal(found.along_frames["temperature"].values, 20 + np.arange(5))
+    assert found.along_frames["temperature"].units == "degC"
+
+
+def test_velox_of_a_camera_and_of_diffraction(tmp_path: Path) -> None:
+    camera = {"Detector-0": {"DetectorName": "HAADF", "DetectorType": "ImagingDetector", "ExposureTime": "0.4"}}
+    found = open_source(velox(tmp_path / "a.emd", Detectors=camera, Scan={})).metadata
+    assert found.frame_time_s == 0.4
+    assert "exposure time" in found.notes[0]
+    reciprocal = {"PixelSize": {"width": "1e8", "height": "1e8"}, "PixelUnitX": "1/m", "PixelUnitY": "1/m"}
+    found = open_source(velox(tmp_path / "b.emd", BinaryResult=reciprocal)).metadata
+    assert found.pixel_size_pm is None
+    assert "measured in 1/m" in found.notes[0]
+
+
+def test_several_signals_of_velox(tmp_path: Path) -> None:
+    path = velox(tmp_path / "a.emd")
+    velox(path, FRAMES[:1], name="b2", mode="a")
+    same(open_source(path))
+    velox(path, FRAMES + 1, name="c3", mode="a")
+    fails(path, "/Data/Image/a1/Data (40, 36, 5) uint16 (HAADF)", "/Data/Image/c3/Data")
+    same(open_source(f"{path}::/Data/Image/c3"), FRAMES + 1)
+
+
+def test_damaged_texts_of_velox_are_a_note(tmp_path: Path) -> None:
+    path = velox(tmp_path / "a.emd")
+    with h5py.File(path, "a") as file:
+        file["Data/Image/a1/Metadata"][:100] = 7
+    source = open_source(path)
+    same(source)
+    assert "calibration cannot be read" in source.metadata.notes[0]
+
+
+def test_values_that_are_to_be_scaled_are_noted(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["data"] = FRAMES
+        file["data"].attrs["scale_factor"] = 0.1
+    assert "multiplied by 0.1 and 0 added" in open_source(tmp_path / "a.h5").metadata.notes[0]
+
+
+def test_pixels_of_a_virtual_data_set_that_come_from_nowhere(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.create_dataset("data", FRAMES.shape, "u2", chunks=(1, 40, 36))[:2] = FRAMES[:2]
+    layout = h5py.VirtualLayout((8, 40, 36), "u2")
+    layout[:5] = h5py.VirtualSource("part.h5", "data", FRAMES.shape)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_virtual_dataset("data", layout)
+    notes = " ".join(open_source(tmp_path / "a.h5").metadata.notes)
+    assert "4,320 of 11,520 pixels of the virtual data set come from no file" in notes
+    assert "part.h5::/data: 3 of 5 chunks were never written" in notes
+
+
+def test_a_heap_of_texts_without_an_end(tmp_path: Path) -> None:
+    path = nexus(tmp_path / "a.nxs", FRAMES, ["frame", "y", "x"])
+    whole = bytearray(path.read_bytes())
+    at = whole.index(b"GCOL") + 16
+    whole[at : at + 400] = bytes(400)
+    path.write_bytes(whole)
+    fails(path, "the texts in the file are damaged")

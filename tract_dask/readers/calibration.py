@@ -1,0 +1,81 @@
+"""Pixel size and times: of axes, and of attributes that programs give to arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .axes import Axis, Order, plain_unit
+from .source import SourceMetadata
+from .times import timed
+from .units import square_pixel, to_pm, to_seconds
+
+
+def calibrated(axes: Sequence[Axis], order: Order, where: str) -> SourceMetadata:
+    """Return pixel size and times as the axes have them; a note for units that are no length, such as 1/nm."""
+    sides = [replace(axes[k], unit=plain_unit(axes[k].unit)) for k in (order.x, order.y)]
+    x_pm, y_pm = (to_pm(abs(side.scale), side.unit) for side in sides)
+    pixel, notes = square_pixel(x_pm if x_pm is not None else y_pm, y_pm)
+    if pixel is None and not sides[0].unit and math.isfinite(sides[0].scale) and sides[0].scale not in (0.0, 1.0):
+        notes = (f"{where}: its pixels have the size {sides[0].scale:g} without a unit; the pixel size is not known",)
+    elif pixel is None and (unit := sides[0].unit) and not to_pm(1.0, unit) and unit.lower() not in _NO_UNITS:
+        notes = (f"{where}: its pixels are measured in {unit}, which is not a length; the pixel size is not known",)
+    times = SourceMetadata() if order.frame is None else _times(axes[order.frame], where)
+    return replace(times, pixel_size_pm=pixel, notes=(*notes, *times.notes))
+
+
+_NO_UNITS = ("", "px", "pixel", "pixels", "<undefined>", "undefined", "none", "n/a", "index", "arb", "a.u.")
+
+
+def _times(axis: Axis, where: str) -> SourceMetadata:
+    unit = plain_unit(axis.unit)
+    second = to_seconds(1.0, unit)
+    if second and axis.values is not None and len(axis.values) > 1:
+        return timed(axis.values * second, Path(where.partition("::")[0]).name)
+    return SourceMetadata(frame_time_s=to_seconds(axis.scale, unit))
+
+
+DECLARED = ("pixel_size_", "frame_time_")
+"""Beginnings of attributes that programs give to arrays, with the unit behind."""
+
+
+def declared(attributes: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """Return pixel size (pm) and frame time (s) by attributes such as ``pixel_size_nm`` and ``frame_time_ms``.
+
+    Examples
+    --------
+    >>> declared({"pixel_size_nm": 0.5, "frame_time_ms": "25", "pixel_size": 3})
+    (500.0, 0.025)
+    """
+    pixel = seconds = None
+    for name, value in attributes.items():
+        unit = name.rpartition("_")[2]
+        if name == f"pixel_size_{unit}":
+            pixel = to_pm(as_number(value), unit) or pixel
+        elif name == f"frame_time_{unit}":
+            seconds = to_seconds(as_number(value), unit) or seconds
+    return pixel, seconds
+
+
+def as_number(value: Any) -> float:
+    """Return a number; NaN where it is none."""
+    try:
+        return float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def packing(scale: float, offset: float, where: str) -> tuple[str, ...]:
+    """Return a note where netCDF says that values are to be scaled: they are read as they are stored."""
+    factor, added = 1.0 if math.isnan(scale) else scale, 0.0 if math.isnan(offset) else offset
+    if (factor, added) == (1.0, 0.0):
+        return ()
+    return (
+        f"{where}: its values are meant to be multiplied by {factor:g} and {added:g} added (scale_factor, add_offset);"
+        " they are read as they are stored",
+    )
