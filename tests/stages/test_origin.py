@@ -165,7 +165,7 @@ LISTINGS = {
     "added": (lambda folder: shutil.copy(folder / "frame_023.tif", folder / "frame_024.tif"), "25 files: frame_024"),
     "taken away": (lambda folder: (folder / "frame_023.tif").unlink(), r"none"),
     "renamed": (lambda folder: (folder / "frame_023.tif").rename(folder / "frame_999.tif"), r"none"),
-    "of another format": (lambda folder: np.save(folder / "dark.npy", FRAMES), "several formats"),
+    "of another format": (lambda folder: np.save(folder / "other.npy", FRAMES), "several formats"),
 }
 
 

@@ -1,5 +1,6 @@
 """The movie store: layout, lossless conversion, resuming, metadata, and what it refuses."""
 
+import json
 import os
 import pickle
 import signal
@@ -598,3 +599,21 @@ def test_time_stamps_that_do_not_grow_are_not_used(stamps):
     known = timed(stamps, "a.seq")
     assert (known.frame_time_s, dict(known.along_frames)) == (None, {})
     assert len(known.notes) == (1 if np.any(stamps) else 0)
+
+
+@pytest.mark.parametrize("name", ["shape", "dtype", "bins", "frames_per_shard", "pixel_size_pm"])
+def test_a_store_that_does_not_say_what_is_needed_is_refused_by_name(name, tmp_path, source):
+    path = convert(source, tmp_path / "movie.zarr")
+    root = json.loads((path / "zarr.json").read_text())
+    about = root["attributes"]["tract_dask"]
+    del about[name], about["checksum"]
+    about["checksum"] = store_metadata.digest(root)
+    (path / "zarr.json").write_text(json.dumps(root))
+    for attempt in (lambda: open_movie(path), lambda: convert(source, path, metadata=KNOWN)):
+        with pytest.raises(StoreError, match=rf"another version.*no {name}.*--overwrite"):
+            attempt()
+
+
+@pytest.mark.parametrize(("said", "number"), [(2, 2), (2.5, 3), ("3", 3), ("TIFF", 1), (None, 1), (float("inf"), 1)])
+def test_the_number_of_a_format_is_read_however_it_is_written(said, number):
+    assert store_metadata.format_of({"format": said}) == number

@@ -9,10 +9,12 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from .calibration import as_number
 from .hdf5_axes import VELOX, text, within
 from .source import FrameValues, SourceMetadata
+from .times import timed_ticks
 from .units import square_pixel, to_pm, to_seconds
 
 _MOST_BYTES, _MOST_COLUMNS = 1 << 20, 1000
@@ -42,9 +44,15 @@ def velox_metadata(dataset: Any, where: str) -> SourceMetadata:
     pixel, notes = square_pixel(*(to_pm(size, unit) for size, unit in zip(sizes, units, strict=True)))
     if pixel is None and units[0] not in ("", "m"):
         notes = (f"{where}: its pixels are measured in {units[0]}, which is not a length; the pixel size is not known",)
-    seconds, how = _frame_time(first, where)
-    along = _along(said) if len(said) == dataset.shape[2] else {}
-    return SourceMetadata(pixel, seconds, notes=(*notes, *how), along_frames=along)
+    every = len(said) == dataset.shape[2]
+    times = timed_ticks(_stamps(said), 1_000_000, where)
+    seconds, how = (times.frame_time_s, times.notes) if times.frame_time_s else _frame_time(first, where)
+    if times.frame_time_s and not every:
+        how += (
+            f"{where}: the time stamps of the first {len(said)} frames give the frame time; the others were not read",
+        )
+    along = _along(said) | dict(times.along_frames) if every else {}
+    return SourceMetadata(pixel, seconds, notes=(*notes, *how), along_frames=along, start_s=times.start_s)
 
 
 def detector_of(dataset: Any) -> str:
@@ -54,14 +62,14 @@ def detector_of(dataset: Any) -> str:
 
 
 def _texts(dataset: Any) -> Iterator[dict[str, Any]]:
-    """Yield the texts of the frames, or the first where there are very many."""
+    """Yield the texts of the frames; of very many frames those of the first."""
     columns = within(dataset.parent, "Metadata", h5py.Dataset)
     if columns is None or columns.ndim != 2 or columns.dtype != np.uint8 or columns.shape[0] > _MOST_BYTES:
         return
     chunk = math.prod(columns.chunks) if columns.chunks else 0
     if chunk > _MOST_BYTES * _MOST_COLUMNS:
         return
-    for k in range(columns.shape[1] if columns.shape[1] <= _MOST_COLUMNS else 1):
+    for k in range(min(columns.shape[1], _MOST_COLUMNS)):
         found = json.loads(columns[:, k].tobytes().partition(b"\0")[0])
         yield found if isinstance(found, dict) else {}
 
@@ -73,15 +81,20 @@ def _at(found: Any, *names: str) -> Any:
     return "" if isinstance(found, dict) else found
 
 
+def _stamps(said: list[dict[str, Any]]) -> NDArray[np.int64]:
+    """Return the moments of a camera's frames in µs since 1970; none where one does not say it."""
+    key = f"Detectors[{_at(said[0], 'BinaryResult', 'Detector')}].TimeStamp"
+    stamps = np.array([as_number(_at(one, "CustomProperties", key, "value")) for one in said])
+    return np.zeros(0, np.int64) if not np.isfinite(stamps).all() else stamps.astype(np.int64)
+
+
 def _frame_time(said: dict[str, Any], where: str) -> tuple[float | None, tuple[str, ...]]:
-    """Return the time of a scan or of a camera's frame; a camera's exposure, and a note, where it has no other."""
+    """Return the time of a scan, or of a camera's exposure with a note: the time of the scan is not that of a camera."""
     name, detectors = _at(said, "BinaryResult", "Detector"), said.get("Detectors")
     listed = [one for one in detectors.values() if isinstance(one, dict)] if isinstance(detectors, dict) else []
     own: dict[str, Any] = next((one for one in listed if name and one.get("DetectorName") == name), {})
     frame, exposure = as_number(_at(said, "Scan", "FrameTime")), as_number(_at(own, "ExposureTime"))
-    if own.get("DetectorType") != "ImagingDetector" or math.isnan(exposure):
-        return to_seconds(frame, "s"), ()
-    if frame >= exposure and as_number(_at(said, "Scan", "ScanSize", "width")) == 0:
+    if own.get("DetectorType") != "ImagingDetector":
         return to_seconds(frame, "s"), ()
     seconds = to_seconds(exposure, "s")
     return seconds, (f"{where}: the frame time is the camera's exposure time",) if seconds else ()

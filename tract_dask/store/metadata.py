@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -111,8 +112,10 @@ def check_nodes(path: Path, about: Mapping[str, Any], changing: Collection[str] 
 
 def format_of(about: Mapping[str, Any]) -> int:
     """Return the number of a store's format, by its attributes; 1 for stores that have none."""
-    number = about.get("format")
-    return number if isinstance(number, int) else 1  # in format 1 it was that of a movie's source
+    try:
+        return math.ceil(float(about["format"]))
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return 1  # where it was the format of a movie's source, in words
 
 
 def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **changes: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -48,15 +48,7 @@ def open_movie(path: str | Path) -> Movie:
             "something else" if path.exists() else "nothing",
             "Convert the movie first",
         )
-    needed = ("shape", "complete", "frames_per_shard", "dtype", "key", "bins", *schema.CALIBRATION)
-    if lacking := [name for name in needed if name not in present]:
-        raise MissingStoreError(
-            "this movie store is of another version",
-            str(path),
-            "all that this version knows of a movie",
-            f"no {', '.join(lacking)}",
-            "Convert the movie again",
-        )
+    check_known(path, present)
     if present.get(CHANGING):
         raise StoreError(
             "its pixel size or frame time is being changed, or that was cut off",
@@ -81,6 +73,27 @@ def open_movie(path: str | Path) -> Movie:
         bins=tuple(present["bins"]),
         **{name: present[name] for name in schema.CALIBRATION},
     )
+
+
+_NEEDED = ("shape", "complete", "frames_per_shard", "dtype", "key", "bins", *schema.CALIBRATION)
+
+
+def check_known(path: Path, present: Mapping[str, Any]) -> None:
+    """Check that a movie store says all of itself that this version needs.
+
+    Raises
+    ------
+    MissingStoreError
+        Naming what it does not say.
+    """
+    if lacking := [name for name in _NEEDED if name not in present]:
+        raise MissingStoreError(
+            "this movie store is of another version",
+            str(path),
+            "all that this version knows of a movie",
+            f"no {', '.join(lacking)}",
+            "Convert the movie again, with --overwrite",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

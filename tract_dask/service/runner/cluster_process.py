@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 _MAIN = f"{__package__}.cluster_main"
 _LOOK_S = 1.0
 _ANSWER_S = 5.0
-_STALE_S = 5.0
+_STALE_S = 30.0
 _STOP_S = 20.0
 
 

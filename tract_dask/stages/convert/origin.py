@@ -15,6 +15,7 @@ from ...settings.run import ConvertSettings, MetadataSettings, SourceSettings
 from ...store import metadata
 from ...store.keys import counted, default_of
 from ...store.layout import plan_layout
+from ...store.movie import check_known
 from ...store.provenance import ALGORITHMS, digest_of, fingerprint, stage_key
 from ...store.stamps import Stamps
 from .create import quantities
@@ -97,6 +98,8 @@ def is_converted(path: Path, source: FrameSource, settings: ConvertSettings, sou
     """Tell whether the movie at ``path`` is complete, and what :func:`convert` would make."""
     present = metadata.attributes(path)
     whole = present.get("kind") == "movie" and bool(present.get("complete"))
+    if whole:
+        check_known(path, present)
     return whole and not _differences(present, source, settings, source_settings)
 
 
