@@ -89,7 +89,7 @@ def _stamps(said: list[dict[str, Any]]) -> NDArray[np.int64]:
 
 
 def _frame_time(said: dict[str, Any], where: str) -> tuple[float | None, tuple[str, ...]]:
-    """Return the time of a scan, or of a camera's exposure with a note: the time of the scan is not that of a camera."""
+    """Return the time of a scan, or a camera's exposure with a note: the scan's time is not that of a camera."""
     name, detectors = _at(said, "BinaryResult", "Detector"), said.get("Detectors")
     listed = [one for one in detectors.values() if isinstance(one, dict)] if isinstance(detectors, dict) else []
     own: dict[str, Any] = next((one for one in listed if name and one.get("DetectorName") == name), {})
