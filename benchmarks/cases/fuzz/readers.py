@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.cases.fuzz.readers 0 10000`` reads 10,000 of them. The bases and mutations are those of
 tests/readers/test_reader_fuzz.py, which runs a few of each. Right: every file gives frames or an error of ours, within
-10 s and 3 GiB; a process that dies costs its one file, and is told.
+10 s and 3 GiB, and at least 30 % of a format open; a process that dies costs its one file, and is told.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import runpy
 import signal
 import subprocess
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..common import Clock, work_folder
 
@@ -38,6 +40,7 @@ def _late(*_: object) -> None:
 
 def read(first: int, last: int, folder: Path) -> Iterator[dict[str, Any]]:
     """Yield the seed before, and the outcome after, each mutated file was read."""
+    sys.path.insert(0, str(TESTS.parents[1] / "helpers"))  # where the tests' writers are
     fuzz = runpy.run_path(str(TESTS))
     bases = sorted(fuzz["BASES"])
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
@@ -92,14 +95,17 @@ def main() -> None:
                 print(json.dumps(record), flush=True)
         return
     ends: Counter[str] = Counter()
+    opened: dict[str, list[bool]] = defaultdict(list)
     at = options.first
     while at < options.last:
         for record in batch(at, min(at + BATCH, options.last)):
             ends[record["end"].split(":")[0]] += 1
+            opened[Path(record["name"]).suffix].append(record["end"] == "ok")
             at = record["seed"] + 1
             if record["end"] not in ("ok", "refused"):
                 print(record, flush=True)
     print(dict(ends))
+    print(*(f"{suffix} {np.mean(ok):.0%} of {len(ok)} open" for suffix, ok in sorted(opened.items())), sep=", ")
 
 
 if __name__ == "__main__":
