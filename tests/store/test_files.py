@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tract_dask.errors import DestinationError, StoreError
 from tract_dask.settings import FitSettings
-from tract_dask.store import files, metadata, provenance
+from tract_dask.store import disk, files, metadata, provenance
 from tract_dask.store.journal import Journal
 from tract_dask.store.keys import counted
 from tract_dask.store.shards import Shard, split
@@ -66,7 +66,7 @@ def test_a_destination_that_holds_something_else_is_refused(tmp_path):
 
 def test_a_small_disk_is_refused_with_both_numbers(tmp_path):
     with pytest.raises(DestinationError, match=r"Expected about 1000000000\.0 GB free; got"):
-        files.check_free_space(tmp_path / "x", 10**18)
+        disk.check_free_space(tmp_path / "x", 10**18)
 
 
 def test_a_full_disk_says_so(tmp_path):

@@ -1,4 +1,4 @@
-"""Files that are on disk before anything says so: written aside, synced, then renamed; one by one, or in batches.
+"""What is on disk: free space, and files that are there before anything says so: written aside, synced, then renamed.
 
 A rename keeps a killed process from leaving half a file. Only a sync before it keeps a loss of power from leaving a
 name without its bytes. To sync is to wait for the disk: the files of a batch are synced together, and large files are
@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import shutil
 import uuid
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +19,8 @@ from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from ..errors import DestinationError
 
 _WRITE_BACK = 2
 """SYNC_FILE_RANGE_WRITE: start writing, and do not wait."""
@@ -194,3 +197,26 @@ def _sync_file_range() -> Any:
         return None
     begin.argtypes = (ctypes.c_int, ctypes.c_int64, ctypes.c_int64, ctypes.c_uint)
     return begin
+
+
+def check_free_space(path: Path, needed: int) -> None:
+    """Check that the disk under ``path`` has ``needed`` bytes free.
+
+    Raises
+    ------
+    DestinationError
+        With both numbers.
+    """
+    free = shutil.disk_usage(next(p for p in (path, *path.absolute().parents) if p.exists())).free
+    if free < needed:
+        raise DestinationError(
+            "the disk is too small for this",
+            str(path),
+            f"about {_readable(needed)} free",
+            _readable(free),
+            "Free some space, or choose another disk",
+        )
+
+
+def _readable(size: int) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"

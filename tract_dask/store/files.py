@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..errors import DestinationError, StoreError
+from ..errors import StoreError
 from . import disk
 
 
@@ -38,29 +38,6 @@ def remove(path: Path) -> None:
         path = aside
     with suppress(FileNotFoundError):
         shutil.rmtree(path)
-
-
-def check_free_space(path: Path, needed: int) -> None:
-    """Check that the disk under ``path`` has ``needed`` bytes free.
-
-    Raises
-    ------
-    DestinationError
-        With both numbers.
-    """
-    free = shutil.disk_usage(next(p for p in (path, *path.absolute().parents) if p.exists())).free
-    if free < needed:
-        raise DestinationError(
-            "the disk is too small for this",
-            str(path),
-            f"about {_readable(needed)} free",
-            _readable(free),
-            "Free some space, or choose another disk",
-        )
-
-
-def _readable(size: int) -> str:
-    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
 @contextmanager

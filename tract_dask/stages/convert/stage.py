@@ -27,7 +27,7 @@ from ...readers.source import FrameSource, SourceMetadata, check_permitted
 from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, SourceSettings
 from ...settings.toml import from_toml, to_toml
 from ...store import datasets, disk, schema
-from ...store.files import check_free_space, disk_errors, remove
+from ...store.files import disk_errors, remove
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.layout import Layout, disk_bytes, plan_layout
 from ...store.metadata import FORMAT, attributes, check_destination, check_nodes, format_of, is_of_system, is_sound
@@ -164,7 +164,7 @@ def _begun(
     """Return the journal of the store at ``path``, which is made anew unless it can be gone on with."""
     origin, key = origin_of(movie), movie_key(movie, settings, source_settings)
     same = _goes_on(path, key, origin.stamps, on_event)
-    check_free_space(path, disk_bytes(layout, settings) - _size(path))
+    disk.check_free_space(path, disk_bytes(layout, settings) - _size(path))
     with disk_errors(path):
         if not same:
             _clear(path)
