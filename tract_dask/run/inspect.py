@@ -13,6 +13,7 @@ import xarray as xr
 from ..errors import StoreError
 from ..readers import open_source
 from ..readers.source import SourceMetadata
+from ..readers.times import has_stamps
 from ..settings.run import RunSettings
 from ..store import datasets, metadata
 from ..store.movie import open_movie
@@ -64,6 +65,8 @@ def _along_frames(known: SourceMetadata) -> dict[str, str]:
     """Return what the headers of the frames say: the first and the last, and the range of what varies."""
     found = {}
     for name, of in known.along_frames.items():
+        if name == "time" and not has_stamps(known):
+            continue
         low, high = np.nanmin(of.values), np.nanmax(of.values)
         found[f"{name} of frames, {of.units}"] = f"{of.values[0]:.6g} to {of.values[-1]:.6g}" + (
             f" (from {low:.6g} to {high:.6g})" if (low, high) != (of.values[0], of.values[-1]) else ""

@@ -138,7 +138,9 @@ def finish(path: Path, **about: Any) -> None:
 
 def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
-    if any(metadata.attributes(path).get(name) != value for name, value in about.items()):
+    present = metadata.attributes(path)
+    same = np.array_equal(np.asarray(datasets.open_dataset(path, only=("time",))["time"]), time)
+    if not same or any(present.get(name) != value for name, value in about.items()):
         datasets.overwrite_array(path / "time", time)
         metadata.update_attributes(path, plain=about, **about)
 
