@@ -169,7 +169,8 @@ def cards(run: Survey) -> list[tuple[str, str, str]]:
     drift = run.known.scale * np.ptp(run.frames["drift"].to_numpy(), axis=0)
     n_frames = run.frames.sizes["frame"]
     frame_time = run.tracks.attrs.get("frame_time_s")
-    lasting = f"{n_frames * frame_time:.4g} s" if frame_time else "frame time not known"
+    last = float(run.frames["time"][-1])  # of which frames were lost, or a part was read, their number does not tell
+    lasting = f"{last + frame_time:.4g} s" if frame_time else "frame time not known"
     fitted = int((columns["fits"] > 0).sum())
     return [
         ("Frames", f"{n_frames:,}", lasting),
