@@ -167,6 +167,8 @@ def test_a_frame_time_of_the_user_in_place_of_stamps_is_said(tmp_path: Path) -> 
         convert(place, tmp_path / "m.zarr", source_settings=every_second, metadata=said, on_event=events.append)
     )
     np.testing.assert_allclose(movie.times(), [0, 0.06, 0.12])
+    part = describe(tmp_path / "m.zarr")["part of the source"]
+    assert part == "from frame 0 on, every 2 frames; from row 0 and column 0 on"
     assert [event.message for event in events if isinstance(event, Warned)] == list(known.notes)
 
 

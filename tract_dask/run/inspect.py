@@ -17,7 +17,7 @@ from ..readers.times import has_stamps
 from ..settings.run import RunSettings
 from ..store import datasets, metadata
 from ..store.movie import open_movie
-from ..store.results import open_results
+from ..store.results import open_results, part_in_words
 from ..store.run_folder import STORES, RunFolder
 from ..store.schema import Status
 
@@ -79,6 +79,7 @@ def _movie(path: Path) -> dict[str, Any]:
     bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
     return {
         "source": metadata.attributes(path).get("source"),
+        **({"part of the source": words} if (words := part_in_words(movie.part)) else {}),
         **_frames(movie.shape, movie.dtype),
         "pixel size, pm": movie.pixel_size_pm,
         "frame time, s": movie.frame_time_s,

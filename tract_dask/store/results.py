@@ -266,6 +266,25 @@ def part_attributes(part: Mapping[str, int] | None) -> dict[str, int]:
     return {f"source_{name}": number for name, number in (part or {}).items()}
 
 
+def part_in_words(part: Mapping[str, int] | None) -> str | None:
+    """Return which part of its source a movie is, for people; None where it is all of it.
+
+    Examples
+    --------
+    >>> part_in_words({"first_frame": 5, "frame_step": 2, "top": 20, "left": 10, "bin_px": 2})
+    'from frame 5 on, every 2 frames; from row 20 and column 10 on; sums of 2 x 2 pixels'
+    """
+    if not part:
+        return None
+    every, side = part["frame_step"], part["bin_px"]
+    said = [
+        f"from frame {part['first_frame']} on" + (f", every {every} frames" if every > 1 else ""),
+        f"from row {part['top']} and column {part['left']} on",
+        *([f"sums of {side} x {side} pixels"] if side > 1 else []),
+    ]
+    return "; ".join(said)
+
+
 def _grown(dataset: xr.Dataset, path: Path) -> xr.Dataset:
     """Return the Dataset of a store that is not complete, with what is fitted so far."""
     import dask.array as da  # takes its time, and workers do not need it
