@@ -23,6 +23,7 @@ from tract_dask.analysis.motion import displacement, lattice_displacement, posit
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.changepoints import critical_penalty, plateaus
 from tract_dask.kernels.gaussian import parameters
+from tract_dask.plots.base import time_of
 from tract_dask.store import schema
 
 PIXEL_PM = 4.0
@@ -265,6 +266,28 @@ def test_rates_and_energies():
     assert float(energy["low"][1]) == pytest.approx(0.0258520 * np.log(1e13 / (3.6889 / 4)), rel=1e-4)
     with pytest.raises(SettingsError, match="--frame-time-s"):
         jump_rate(jumps, tracks.assign_attrs(frame_time_s=None))
+
+
+def test_a_rate_counts_the_time_in_which_frames_were_lost():
+    places = still(41, 2)
+    places[10:12, 1] = np.nan
+    tracks = tracks_of(places)
+    time = 0.1 * np.arange(41.0)
+    time[20:] += 6.0
+    jumps = xr.Dataset({"column_id": ("jump", [1, 1, 1, 1, 1])})
+    lost = jump_rate(jumps, tracks.assign(time=("frame", time)))
+    np.testing.assert_allclose(lost["rate"], [0.5, 0])
+    np.testing.assert_allclose(lost["high"][1], 3.6889 / 9.8, rtol=1e-4)
+    halves = jump_rate(jumps, tracks.assign(time=("frame", time)).isel(frame=slice(None, None, 2)))
+    np.testing.assert_allclose(halves["rate"], [0.5, 0])
+    untold = tracks.assign(time=("frame", np.arange(41.0)))  # the frame time was given to the tracks later
+    np.testing.assert_allclose(jump_rate(jumps, untold)["rate"], [1.25, 0])
+    assert time_of(untold)[0][-1] == pytest.approx(4.0)
+    assert time_of(tracks.assign(time=("frame", time)))[0][-1] == 10.0
+
+
+def test_energies_need_a_temperature():
+    rate = jump_rate(xr.Dataset({"column_id": ("jump", [1])}), tracks_of(still(41, 3)))
     with pytest.raises(SettingsError, match="temperature_k"):
         activation_energy(rate, 0.0)
 

@@ -11,7 +11,13 @@ import pytest
 from files_stamped import write_seq
 
 from tract_dask.errors import SourceError
+from tract_dask.progress import Warned
 from tract_dask.readers import open_source
+from tract_dask.readers.times import has_stamps, timed
+from tract_dask.run.inspect import describe
+from tract_dask.settings.run import MetadataSettings, RunSettings, SourceSettings
+from tract_dask.stages.convert.stage import convert
+from tract_dask.store.movie import open_movie
 
 FRAMES = np.random.default_rng(0).integers(0, 250, (6, 12, 16)).astype("u2")
 
@@ -117,3 +123,57 @@ def test_a_damaged_stride_that_makes_billions_of_frames(tmp_path: Path) -> None:
     os.truncate(path, 2**31)  # a sparse file
     with pytest.raises(SourceError, match="number of frames is impossible"):
         open_source(path)
+
+
+STAMPS_US = [0, 33_002, 65_798, 98_800, 1_135_389, 1_168_943]
+"""Times of six frames that come unevenly; some were lost after the fourth."""
+
+
+@pytest.mark.parametrize(
+    ("frames", "times", "step"),
+    [
+        (None, [0, 0.033002, 0.065798, 0.0988, 1.135389, 1.168943], 0.033002),
+        ("0:4", [0, 0.033002, 0.065798, 0.0988], 0.033002),
+        ("1:3", [0, 0.032796], 0.032796),
+        ("::3", [0, 0.0988], 0.0988),
+        ("1::3", [0, 1.102387], 1.102387),
+        ("::2", [0, 0.065798, 1.135389], 0.5676945),
+    ],
+)
+def test_a_part_has_the_times_of_its_stamps(
+    frames: str | None, times: list[float], step: float, tmp_path: Path
+) -> None:
+    place, declared = write_seq(tmp_path / "a.seq", FRAMES, stamps_us=STAMPS_US), SourceSettings(frames=frames)
+    known = open_source(place, declared).metadata
+    np.testing.assert_allclose(known.along_frames["time"].values, times, atol=1e-9)
+    assert known.frame_time_s == pytest.approx(step)
+    movie = open_movie(convert(place, tmp_path / "movie.zarr", source_settings=declared))
+    np.testing.assert_allclose(movie.times(), times, atol=1e-9)
+
+
+def test_a_frame_time_of_the_user_in_place_of_stamps_is_said(tmp_path: Path) -> None:
+    place = write_seq(tmp_path / "a.seq", FRAMES, stamps_us=STAMPS_US)
+    said, every_second = MetadataSettings(frame_time_s=0.03), SourceSettings(frames="::2")
+    known = open_source(place, every_second, said).metadata
+    assert known.frame_time_s == 0.06
+    assert not any("the times of frames show it" in note for note in known.notes)
+    (note,) = [note for note in known.notes if "as you say" in note]
+    assert "0.06 s apart, as you say" in note
+    assert "0.5676945 s apart, are not used" in note
+    assert "time of frames, s" not in describe(place, RunSettings(source=every_second, metadata=said))
+    assert describe(place)["time of frames, s"] == "0 to 1.16894"
+    events: list[Any] = []
+    movie = open_movie(
+        convert(place, tmp_path / "m.zarr", source_settings=every_second, metadata=said, on_event=events.append)
+    )
+    np.testing.assert_allclose(movie.times(), [0, 0.06, 0.12])
+    part = describe(tmp_path / "m.zarr")["part of the source"]
+    assert part == "from frame 0 on, every 2 frames; from row 0 and column 0 on"
+    assert [event.message for event in events if isinstance(event, Warned)] == list(known.notes)
+
+
+def test_stamps_of_a_fast_camera_are_used_though_they_are_whole_nanoseconds() -> None:
+    stamps = 1.23456789e-5 * np.array([0, 1, 2, 3, 1000])
+    known = timed(stamps, "a")
+    assert known.frame_time_s == pytest.approx(1.23456789e-5, rel=1e-8)
+    assert has_stamps(known)

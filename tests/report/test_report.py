@@ -19,7 +19,7 @@ from tract_dask.report import page
 from tract_dask.report import survey as survey_module
 from tract_dask.report.findings import findings
 from tract_dask.report.interactive import quantised, script_json
-from tract_dask.report.page import is_current, write_report
+from tract_dask.report.page import cards, is_current, write_report
 from tract_dask.report.survey import gathered, survey
 from tract_dask.service.api.results import _REPORT_POLICY
 from tract_dask.service.views import tracks as tracks_of_job
@@ -263,10 +263,27 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path):
 def test_warnings_of_the_run_itself_are_repeated(run):
     events = [
         {"event": "Warned", "message": "of an earlier run"},
-        {"event": "RunStarted"},
+        {"event": "RunStarted", "dashboard": ""},
+        {"event": "Warned", "message": "a part of the movie is read"},
+        {"event": "RunStarted", "dashboard": "http://127.0.0.1:8787/status"},
         {"event": "Warned", "message": "columns.csv was edited by hand"},
     ]
-    assert [finding.text for finding in findings(survey(run.write(), events))] == ["Columns.csv was edited by hand."]
+    said = [finding.text for finding in findings(survey(run.write(), events))]
+    assert said == ["A part of the movie is read.", "Columns.csv was edited by hand."]
+
+
+def test_a_movie_with_lost_frames_lasts_as_long_as_its_times_say(run):
+    run.values["time"][20:] += 6.0
+    name, number, lasting = cards(survey(run.write(), []))[0]
+    assert (name, number, lasting) == ("Frames", f"{N_FRAMES}", f"{0.1 * N_FRAMES + 6:g} s")
+
+
+def test_why_no_errors_are_known_is_said(run):
+    _no_errors(run)
+    assert [found.text for found in findings(survey(run.write(), []))] == [
+        "The fits state no errors of the positions: after a blur of 2 px too few pixels are independent in a window "
+        "that is 19 px across."
+    ]
 
 
 def test_series_keep_the_extremes(run, monkeypatch):

@@ -25,7 +25,7 @@ from tract_dask.service.views import exports, track_cache, tracks
 from tract_dask.service.views.exports import Exports
 from tract_dask.settings import FitSettings
 from tract_dask.store import files as store_files
-from tract_dask.store import metadata, results, schema
+from tract_dask.store import results, schema
 from tract_dask.store.provenance import provenance
 from tract_dask.store.schema import Status
 from tract_dask.store.shards import split
@@ -245,6 +245,16 @@ def test_of_an_unfinished_store_finished_shards_count_and_no_others(service):
     assert get(service, "/displacement", first=0, second=13)["columns"][1]["dx"] is not None
 
 
+def test_times_are_those_of_the_stamps_where_frames_were_lost(service):
+    fits, time = service.fits, FRAME_S * np.arange(N_FRAMES)
+    time[12:] += 5.0
+    fits.finish()
+    results.calibrate(fits.path, time, pixel_size_pm=PIXEL_PM, frame_time_s=FRAME_S, dose=None)
+    assert get(service, "")["last_time"] == pytest.approx(time[-1])
+    np.testing.assert_allclose(get(service, "/series/1", start=10, stop=14)["t"], time[10:14])
+    np.testing.assert_allclose(get(service, "/frames")["t"], time)
+
+
 def test_shards_that_are_added_make_the_same_as_all_at_once(service, tmp_path):
     fits, versions = service.fits, set()
     for index in (4, 0, 5, 2, 1, 3):
@@ -281,8 +291,9 @@ def test_a_copy_is_made_anew_where_it_was_deleted(service, tmp_path):
 
 
 def test_without_a_pixel_size_lengths_are_in_px(service):
-    metadata.update_attributes(service.fits.path, pixel_size_pm=None, frame_time_s=None)
     service.fits.finish()
+    numbers = np.arange(N_FRAMES, dtype=float)
+    results.calibrate(service.fits.path, numbers, pixel_size_pm=None, frame_time_s=None, dose=None)
     found = get(service, "/series/1")
     assert (found["unit"], found["time_unit"]) == ("px", "frames")
     np.testing.assert_allclose(array(found["dx"]), array(found["x"]) - found["x_ref"], atol=2e-6)

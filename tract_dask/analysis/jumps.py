@@ -17,7 +17,7 @@ from ..errors import SettingsError
 from ..kernels.changepoints import gains, plateaus
 from ..kernels.gaussian.intensity import Floats
 from ..store import schema
-from .motion import named, positions, standard_errors
+from .motion import frame_times, named, positions, standard_errors
 
 _BLOCK_BYTES = 128 << 20
 """Columns are read in blocks of so many bytes: places and errors of all their frames."""
@@ -195,8 +195,9 @@ def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -
     jumps
         From :func:`threshold_jumps` or :func:`change_points`.
     tracks
-        The results in which they were found. A column is watched for as many frame times as it has accepted frames,
-        less one.
+        The results in which they were found. A column is watched from each accepted frame to the next: for the time
+        between them where they follow each other, also where the camera lost frames between them; for one frame time
+        where fits between them were not accepted.
     confidence
         Of the interval.
 
@@ -213,18 +214,10 @@ def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -
     """
     if not 0 < confidence < 1:
         raise SettingsError("the confidence is out of range", "confidence", "between 0 and 1", f"{confidence:g}")
-    frame_time = tracks.attrs.get("frame_time_s")
-    if not frame_time:
-        raise SettingsError(
-            "the time of a frame is not known",
-            "tracks.attrs['frame_time_s']",
-            "seconds for one frame",
-            repr(frame_time),
-            "Run again with --frame-time-s, or say tracks.assign_attrs(frame_time_s=0.1)",
-        )
     n = (tracks["column_id"] == jumps["column_id"].rename(None)).sum("jump").to_numpy()
-    watched = (positions(tracks).notnull().all("axis").sum("frame") - 1).clip(min=0).compute() * frame_time
-    time = watched.where(watched > 0).to_numpy()
+    seen = positions(tracks).notnull().all("axis").transpose("frame", "column_id").to_numpy()
+    watched = _watched(seen, frame_times(tracks), float(tracks.attrs["frame_time_s"]))
+    time = np.where(watched > 0, watched, np.nan)
     tail = (1 - confidence) / 2
     low, high = np.where(n > 0, gammaincinv(np.maximum(n, 1), tail), 0.0), gammainccinv(n + 1, tail)
     found = {
@@ -241,6 +234,14 @@ def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -
         },
         attrs={"confidence": confidence},
     )
+
+
+def _watched(seen: NDArray[np.bool_], times: Floats, frame_time: float) -> Floats:
+    """Return for how long (columns,) each column is watched, s; ``seen`` (frames, columns), ``times`` (frames,)."""
+    both = seen[1:] & seen[:-1]
+    after_gaps = np.maximum(seen.sum(axis=0) - 1, 0) - both.sum(axis=0)
+    watched: Floats = np.diff(times) @ both + frame_time * after_gaps
+    return watched
 
 
 def activation_energy(rate: xr.Dataset, temperature_k: float, attempt_frequency_hz: float = 1e13) -> xr.Dataset:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..store import results, schema
@@ -34,6 +35,23 @@ def dose_of(tracks: xr.Dataset) -> float:
     """
     again = "Run again with --dose, or give the dose here"
     return _calibrated(tracks, "dose", "the dose of a frame is not known", "electrons for one square angstrom", again)
+
+
+def frame_times(tracks: xr.Dataset) -> NDArray[np.float64]:
+    """Return the time of every frame (frames,) in s, also where frames were lost or left out between them.
+
+    Tracks that know no times, as where the frame time was told them later, have multiples of the frame time.
+
+    Raises
+    ------
+    SettingsError
+        Where the time of a frame is not known.
+    """
+    again = "Run again with --frame-time-s, or say tracks.assign_attrs(frame_time_s=0.1)"
+    step = _calibrated(tracks, "frame_time_s", "the time of a frame is not known", "seconds for one frame", again)
+    frame = tracks["frame"].to_numpy().astype(np.float64)
+    times = tracks["time"].to_numpy().astype(np.float64) if "time" in tracks else frame
+    return frame * step if np.array_equal(times, np.arange(len(times))) or np.array_equal(times, frame) else times
 
 
 def _calibrated(tracks: xr.Dataset, name: str, problem: str, expected: str, remedy: str) -> float:

@@ -56,10 +56,6 @@ class Calibration:
         """Of times: frames where the time of one is not known."""
         return "s" if self.frame_time_s else "frames"
 
-    def times(self, frames: Floats) -> Floats:
-        """Return the times of frames."""
-        return frames * (self.frame_time_s or 1.0)
-
 
 @dataclass(frozen=True)
 class ColumnSums:

@@ -20,6 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
+from ..analysis.motion import frame_times
 from ..errors import SettingsError
 from ..kernels.gaussian.intensity import Floats
 from ..kernels.greys import block_means, contrast
@@ -295,8 +296,8 @@ def write_ids(axes: Axes, columns: xr.Dataset, chosen: Sequence[int], colours: S
 
 def time_of(tracks: xr.Dataset) -> tuple[Floats, str]:
     """Return the time of every frame and what it is called: in s where the time of a frame is known."""
-    if tracks.attrs.get("frame_time_s") and "time" in tracks:
-        return tracks["time"].to_numpy().astype(np.float64), "Time (s)"
+    if tracks.attrs.get("frame_time_s"):
+        return frame_times(tracks), "Time (s)"
     return tracks["frame"].to_numpy().astype(np.float64), "Frame"
 
 

@@ -28,7 +28,7 @@ from .mrc import open_mrc
 from .npy import open_npy
 from .recipes import unknown_format
 from .registry import Reader, by_suffix
-from .selection import select
+from .selection import overridden, select
 from .seq import belongs_to_seq, open_seq
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
@@ -142,14 +142,12 @@ def open_source(
     known = source.metadata
     merged = replace(
         known,
-        pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
-        frame_time_s=known.frame_time_s if metadata.frame_time_s is None else metadata.frame_time_s,
-        dose=known.dose if metadata.dose is None else metadata.dose,
         gain=metadata.gain,
         notes=known.notes + _not_applied(known),
     )
     listed = tuple(place) if isinstance(place, list) else ()
-    return select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
+    part = select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
+    return replace(part, metadata=overridden(part.metadata, metadata, settings))
 
 
 def _not_applied(known: SourceMetadata) -> tuple[str, ...]:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import SettingsError
-from ..settings.run import SourceSettings
+from ..settings.run import MetadataSettings, SourceSettings
 from .source import Frames, FrameValues, Part, Source, SourceMetadata
+from .times import SHOWN, has_stamps, usual_step
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,6 +137,36 @@ def frame_step(settings: SourceSettings) -> int:
     return int(found[3] or 1) if found else 1
 
 
+def overridden(found: SourceMetadata, said: MetadataSettings, declared: SourceSettings) -> SourceMetadata:
+    """Return what is known of the part that is read, with what the user says above what the source says.
+
+    The user speaks of the pixels and frames of the source, whatever part of it is read. A note tells of time stamps
+    that do not count because of it.
+    """
+    known = found
+    if said.pixel_size_pm is not None:
+        known = replace(known, pixel_size_pm=said.pixel_size_pm * declared.bin)
+    if said.dose is not None:
+        known = replace(known, dose=said.dose)
+    if said.gain != MetadataSettings().gain:
+        known = replace(known, gain=said.gain)
+    if said.frame_time_s is None:
+        return known
+    known = replace(known, frame_time_s=said.frame_time_s * frame_step(declared))
+    return known if "time" not in known.along_frames or has_stamps(known) else _without_stamps(known)
+
+
+def _without_stamps(known: SourceMetadata) -> SourceMetadata:
+    """Return what is known, with the note that the frame time of the user counts more than the time stamps."""
+    step = usual_step(known.along_frames["time"].values)
+    note = (
+        f"the frames are {known.frame_time_s:.9g} s apart, as you say; their time stamps, usually {step:.9g} s apart, "
+        "are not used, and gaps do not show in the times of frames. Leave the frame time out to use the time stamps"
+    )
+    notes = tuple(text.removesuffix(SHOWN) for text in known.notes if text != note)
+    return replace(known, notes=(*notes, note))
+
+
 def _frames(text: str | None, whole: Source) -> range:
     return span(text, whole.shape[0], "frames") if text else range(whole.shape[0])
 
@@ -199,10 +230,13 @@ def _metadata(
         times = along["time"]
         along["time"] = FrameValues(times.values - times.values[0], times.units)
     pixel, seconds = known.pixel_size_pm, known.frame_time_s
+    seconds = seconds and seconds * frames.step
+    if has_stamps(known) and len(frames) > 1:  # steps vary, and frames may be lost
+        seconds = usual_step(along["time"].values)
     return replace(
         known,
         pixel_size_pm=pixel and pixel * settings.bin,
-        frame_time_s=seconds and seconds * frames.step,
+        frame_time_s=seconds,
         notes=(*known.notes, *_said(frames, field, settings, shape)),
         along_frames=along,
         part=Part(frames.start, frames.step, field[0], field[2], settings.bin),

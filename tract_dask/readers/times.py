@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..settings.run import is_step_of
 from .source import FrameValues, SourceMetadata
 
 _LOST = 1.5
 """A step so many times the usual one is a gap, in which frames were lost."""
+
+SHOWN = "; the times of frames show it"
+"""The end of the note on a gap, where the stamps are the times of the frames."""
 
 
 def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
@@ -38,6 +42,17 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     if not np.any(stamps):
         return SourceMetadata()  # a header that was left empty
     return _course(stamps, float(stamps[0]), where)
+
+
+def usual_step(times: NDArray[np.float64]) -> float:
+    """Return the median step of two or more times, to nine digits."""
+    return float(f"{np.median(np.diff(times)):.9g}")
+
+
+def has_stamps(known: SourceMetadata) -> bool:
+    """Tell whether the time stamps are the times of the frames: not where the user gave another frame time."""
+    stamps = known.along_frames.get("time")
+    return stamps is not None and (len(stamps.values) < 2 or is_step_of(usual_step(stamps.values), known.frame_time_s))
 
 
 def timed_ticks(ticks: NDArray[np.int64], per_second: int, where: str) -> SourceMetadata:
@@ -74,5 +89,5 @@ def _gaps(steps: NDArray[np.float64], usual: float, where: str) -> tuple[str, ..
     more = f" (and {len(wide) - 1} more)" if len(wide) > 1 else ""
     return (
         f"{where}: the time stamps have a gap of {steps[wide[0]]:.6g} s after frame {wide[0]}{more}, where a frame"
-        f" takes {usual:.6g} s; the times of frames show it",
+        f" takes {usual:.6g} s{SHOWN}",
     )

@@ -189,12 +189,22 @@ def _flags(run: Survey) -> Iterator[Finding]:
         yield Finding("shape_at_bound", "Widths are not well determined", text, remedy, serious=False)
 
 
+def _why_no_errors(run: Survey) -> tuple[str, str]:
+    """Return why the fits state no errors, and what to do."""
+    fit = run.settings.fit if run.settings else None
+    if fit is None or fit.filters_frames:
+        text = "The fits state no errors of the positions; after the filters wiener and tv-l1 they are not known."
+        return text, "Take the spread of columns that keep still."
+    text = (
+        f"The fits state no errors of the positions: after a blur of {fit.window_blur_px:g} px too few pixels are "
+        f"independent in a window that is {run.tracks.attrs['window_px']} px across."
+    )
+    return text, "Take a smaller --blur-sigma-px, a larger --window-px, or a smaller --bin."
+
+
 def _errors(run: Survey) -> Iterator[Finding]:
     if run.accepted and not np.isfinite(run.columns["expected"]).any():
-        text = "The fits state no errors of the positions; after the filters wiener and tv-l1 they are not known."
-        yield Finding(
-            "no_errors", "No errors are known", text, "Take the spread of columns that keep still.", serious=False
-        )
+        yield Finding("no_errors", "No errors are known", *_why_no_errors(run), serious=False)
     if np.isfinite(run.factor) and run.frames.sizes["frame"] > 2 and not FACTOR[0] <= run.factor <= FACTOR[1]:
         more = run.factor > 1
         text = (
@@ -247,8 +257,12 @@ def _spacing(run: Survey) -> float | None:
 
 
 def _told(run: Survey) -> Iterator[Finding]:
-    """Repeat what the last run said itself."""
-    starts = [number for number, event in enumerate(run.events) if event.get("event") == "RunStarted"]
+    """Repeat what the last run said itself: it begins where no dashboard is known yet, and says so again with one."""
+    starts = [
+        number
+        for number, event in enumerate(run.events)
+        if event.get("event") == "RunStarted" and not event.get("dashboard")
+    ]
     for event in run.events[starts[-1] if starts else 0 :]:
         if event.get("event") == "Warned":
             yield Finding(

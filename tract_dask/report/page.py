@@ -25,6 +25,7 @@ from ..settings.run import RunSettings
 from ..store import files, metadata
 from ..store.files import read_small
 from ..store.provenance import digest_of
+from ..store.results import part_in_words
 from ..store.run_folder import RunFolder
 from ..web import bundle
 from ..web.bundle import STATIC
@@ -169,7 +170,8 @@ def cards(run: Survey) -> list[tuple[str, str, str]]:
     drift = run.known.scale * np.ptp(run.frames["drift"].to_numpy(), axis=0)
     n_frames = run.frames.sizes["frame"]
     frame_time = run.tracks.attrs.get("frame_time_s")
-    lasting = f"{n_frames * frame_time:.4g} s" if frame_time else "frame time not known"
+    last = float(run.frames["time"][-1])  # of which frames were lost, or a part was read, their number does not tell
+    lasting = f"{last + frame_time:.4g} s" if frame_time else "frame time not known"
     fitted = int((columns["fits"] > 0).sum())
     return [
         ("Frames", f"{n_frames:,}", lasting),
@@ -303,6 +305,7 @@ def measured(run: Survey) -> list[tuple[str, str]]:
         "Movie": _source(run),
         "Format": movie.get("source_format"),
         "Frames": f"{shape[0]:,} of {shape[2]:,} × {shape[1]:,} px ({movie.get('dtype', 'dtype not known')})",
+        "Part of the source": part_in_words(movie.get("part")),
         "Size of a pixel": f"{known['pixel_size_pm']:g} pm" if run.known.unit == "pm" else "not known",
         "Field of view": f"{shape[2] * run.known.scale / 1000:.3g} × {shape[1] * run.known.scale / 1000:.3g} nm"
         if run.known.unit == "pm"

@@ -13,10 +13,11 @@ import xarray as xr
 from ..errors import StoreError
 from ..readers import open_source
 from ..readers.source import SourceMetadata
+from ..readers.times import has_stamps
 from ..settings.run import RunSettings
 from ..store import datasets, metadata
 from ..store.movie import open_movie
-from ..store.results import open_results
+from ..store.results import open_results, part_in_words
 from ..store.run_folder import STORES, RunFolder
 from ..store.schema import Status
 
@@ -64,6 +65,8 @@ def _along_frames(known: SourceMetadata) -> dict[str, str]:
     """Return what the headers of the frames say: the first and the last, and the range of what varies."""
     found = {}
     for name, of in known.along_frames.items():
+        if name == "time" and not has_stamps(known):
+            continue
         low, high = np.nanmin(of.values), np.nanmax(of.values)
         found[f"{name} of frames, {of.units}"] = f"{of.values[0]:.6g} to {of.values[-1]:.6g}" + (
             f" (from {low:.6g} to {high:.6g})" if (low, high) != (of.values[0], of.values[-1]) else ""
@@ -76,6 +79,7 @@ def _movie(path: Path) -> dict[str, Any]:
     bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
     return {
         "source": metadata.attributes(path).get("source"),
+        **({"part of the source": words} if (words := part_in_words(movie.part)) else {}),
         **_frames(movie.shape, movie.dtype),
         "pixel size, pm": movie.pixel_size_pm,
         "frame time, s": movie.frame_time_s,

@@ -20,6 +20,7 @@ from ..progress import STAGES
 from ..readers import open_source
 from ..readers.listing import FileList
 from ..readers.source import Permit
+from ..readers.times import has_stamps
 from ..run.checks import check_inputs, check_output
 from ..run.plan import Plan, plan_run
 from ..settings.run import RunSettings, SourceSettings
@@ -191,6 +192,7 @@ def about_movie(place: str | FileList, declared: dict[str, Any], permit: Permit)
             "bytes": _raw_bytes(source.shape, source.dtype.name),
             "pixel_size_pm": known.pixel_size_pm,
             "frame_time_s": known.frame_time_s,
+            "time_stamps": has_stamps(known),
             "dose": known.dose,
             "gain": known.gain,
             "warnings": list(known.notes),

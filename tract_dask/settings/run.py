@@ -6,6 +6,7 @@ and the checks come from that declaration.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,6 +45,14 @@ class MetadataSettings(Settings):
     gain: float = setting(
         1.0, "Electron counts for one detector unit", unit="counts", low=1e-12, high=1e12, common=True
     )
+
+
+def is_step_of(step_s: float, frame_time_s: float | None) -> bool:
+    """Tell whether time stamps with this usual step have this frame time, so that they are the times of the frames.
+
+    Stamps are kept to a nanosecond. Another frame time is one that the user gave: it counts more than the stamps.
+    """
+    return frame_time_s is not None and math.isclose(step_s, frame_time_s, rel_tol=1e-6, abs_tol=2e-9)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from ..settings.run import is_step_of
 from . import datasets, metadata, schema
 from .damage import METADATA, read_json
 
@@ -61,7 +61,7 @@ def _times(path: Path, ours: dict[str, Any]) -> NDArray[np.float64]:
     if step and n_frames > 1 and "time" in ours.get("frame_values", ()):
         opened: Any = datasets.open_array if ours["complete"] else zarr.open_array  # to which missing chunks are NaN
         stamps = np.asarray(opened(path / frame_array("time"))[:], np.float64)
-        if math.isclose(np.median(np.diff(stamps)), step, rel_tol=1e-6):
+        if is_step_of(float(np.median(np.diff(stamps))), step):
             return stamps
     return np.arange(n_frames) * (step or 1.0)
 

@@ -138,7 +138,9 @@ def finish(path: Path, **about: Any) -> None:
 
 def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
-    if any(metadata.attributes(path).get(name) != value for name, value in about.items()):
+    present = metadata.attributes(path)
+    same = np.array_equal(np.asarray(datasets.open_dataset(path, only=("time",))["time"]), time)
+    if not same or any(present.get(name) != value for name, value in about.items()):
         datasets.overwrite_array(path / "time", time)
         metadata.update_attributes(path, plain=about, **about)
 
@@ -262,6 +264,25 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
 def part_attributes(part: Mapping[str, int] | None) -> dict[str, int]:
     """Return which part of its source a movie is, as attributes of its tracks; none where it is all of it."""
     return {f"source_{name}": number for name, number in (part or {}).items()}
+
+
+def part_in_words(part: Mapping[str, int] | None) -> str | None:
+    """Return which part of its source a movie is, for people; None where it is all of it.
+
+    Examples
+    --------
+    >>> part_in_words({"first_frame": 5, "frame_step": 2, "top": 20, "left": 10, "bin_px": 2})
+    'from frame 5 on, every 2 frames; from row 20 and column 10 on; sums of 2 x 2 pixels'
+    """
+    if not part:
+        return None
+    every, side = part["frame_step"], part["bin_px"]
+    said = [
+        f"from frame {part['first_frame']} on" + (f", every {every} frames" if every > 1 else ""),
+        f"from row {part['top']} and column {part['left']} on",
+        *([f"sums of {side} x {side} pixels"] if side > 1 else []),
+    ]
+    return "; ".join(said)
 
 
 def _grown(dataset: xr.Dataset, path: Path) -> xr.Dataset:

@@ -68,6 +68,7 @@ class About(BaseModel):
                 "bytes": 2147483648,
                 "pixel_size_pm": 8.0,
                 "frame_time_s": 0.025,
+                "time_stamps": False,
                 "dose": None,
                 "gain": 1.0,
                 "warnings": [],
@@ -83,6 +84,7 @@ class About(BaseModel):
     bytes: int = Field(description="Of all frames, uncompressed.")
     pixel_size_pm: float | None = Field(description="Side of a pixel in pm; null: the file does not say.")
     frame_time_s: float | None = Field(description="From one frame to the next, in s.")
+    time_stamps: bool = Field(description="Whether each frame has a time stamp; ``frame_time_s`` is their usual step.")
     dose: float | None = Field(description="Of a frame, in e/A^2.")
     gain: float = Field(description="Electron counts for one detector unit.")
     warnings: list[str] = Field(description="What the user should read.")

@@ -37,6 +37,7 @@ class Summary(Answer):
     accepted: int = Field(description="Fits that nothing speaks against.")
     pixel_size_pm: Number
     frame_time_s: Number
+    last_time: float = Field(description="Of the last frame, in ``time_unit``, from the first one on.")
     dose: Number = Field(description="Of one frame, e/A^2.")
     unit: str = Field(description=_UNIT)
     time_unit: str = Field(description=_TIME_UNIT)

@@ -49,6 +49,7 @@ def summary(folder: Path, cache: Path, version: str) -> bytes:
             **dataclasses.asdict(known),
             "unit": known.unit,
             "time_unit": known.time_unit,
+            "last_time": float(_times(path)[-1]),
             "window_px": about.get("window"),
             "source": Path(str(about.get("source", ""))).name,
             "created": about.get("created"),
@@ -117,7 +118,7 @@ def series(
         "time_unit": known.time_unit,
         "frames_per_point": step,
         "frame": list(range(start, stop, step)),
-        "t": numbers_of(known.times(_middles(start, stop, step))),
+        "t": numbers_of(overview.binned_mean(_times(path)[start:stop], step)),
         "accepted": np.add.reduceat(np.isfinite(own["x"]), np.arange(0, stop - start, step), dtype=int).tolist(),
     }
     for name in overview.QUANTITIES:
@@ -143,7 +144,7 @@ def frames(folder: Path, cache: Path, points: int, version: str) -> bytes:
             "pixel_size_pm": known.pixel_size_pm,
             "frames_per_point": step,
             "frame": list(range(0, n_frames, step)),
-            "t": numbers_of(known.times(_middles(0, n_frames, step))),
+            "t": numbers_of(overview.binned_mean(_times(path), step)),
             "accepted_share": numbers_of(found["share"]),
             **{name: numbers_of(found[name]) for name in ("drift_x", "drift_y", "amplitude")},
         }
@@ -252,9 +253,9 @@ def _range(frames: tuple[int, int | None], n_frames: int) -> tuple[int, int]:
     return start, stop
 
 
-def _middles(start: int, stop: int, step: int) -> Floats:
-    first = np.arange(start, stop, step)
-    return (first + np.minimum(first + step, stop) - 1) / 2
+def _times(path: Path) -> Floats:
+    """Return the time of every frame (frames,), as its stamps say; its number where the frame time is not known."""
+    return np.asarray(datasets.open_dataset(path, only=("time",))["time"].to_numpy(), np.float64)
 
 
 def _points(name: str, values: Floats, error: Floats, step: int) -> dict[str, Any]:

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from ...cluster.tasks import stream_shards
 from ...errors import ChangedSourceError, DestinationError, SourceError, StoreError
 from ...progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from ...readers import files_named_now, open_source
-from ...readers.selection import frame_step
+from ...readers.selection import overridden
 from ...readers.source import FrameSource, SourceMetadata, check_permitted
 from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, SourceSettings
 from ...settings.toml import from_toml, to_toml
@@ -38,7 +37,7 @@ from ...store.shards import Shard, split
 from ...store.stamps import Stamps, changed
 from ..keep import Workers
 from ..pixel_range import check_pixels
-from .create import create, finalise, quantities, update_metadata
+from .create import create, finalise, update_metadata
 from .origin import (
     AS_THE_FILE_SAYS,
     DECLARED_NOTHING,
@@ -99,7 +98,7 @@ def convert(
     """
     started = time.perf_counter()
     movie = open_source(source, source_settings, metadata) if isinstance(source, str | Path) else source
-    known = _overridden(movie.metadata, metadata, source_settings)
+    known = overridden(movie.metadata, metadata, source_settings)
     path = Path(destination).absolute()
     for note in known.notes:
         on_event(Warned(note))
@@ -338,20 +337,6 @@ def _clear(path: Path) -> None:
 def _size(path: Path) -> int:
     """Return the bytes of the files under ``path``: what replacing it frees, or what is written already."""
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-
-
-def _overridden(found: SourceMetadata, metadata: MetadataSettings, declared: SourceSettings) -> SourceMetadata:
-    """Return what is known of the movie, with what the user says above what the source says.
-
-    The user speaks of the pixels and frames of the source, whatever part of it is read.
-    """
-    said = {name: value for name, value in quantities(metadata).items() if value is not None}
-    if said["gain"] == AS_THE_FILE_SAYS.gain:
-        del said["gain"]
-    for name, factor in (("pixel_size_pm", declared.bin), ("frame_time_s", frame_step(declared))):
-        if name in said:
-            said[name] *= factor
-    return replace(found, **said)
 
 
 def _place(source: FrameSource) -> str | tuple[str, ...]:

@@ -51,6 +51,7 @@ import { at } from "./dom.js";
  * @property {number | null} frame_time_s
  * @property {number | null} dose
  * @property {number | null} gain
+ * @property {boolean} time_stamps
  * @property {string[]} warnings
  * @typedef {object} Summary of results
  * @property {string} version
@@ -64,6 +65,7 @@ import { at } from "./dom.js";
  * @property {number | null} frame_time_s
  * @property {number | null} dose
  * @property {string} unit
+ * @property {number} last_time
  * @property {string} time_unit
  * @property {number | null} window_px
  * @property {string | null} created

@@ -86,7 +86,7 @@ export class MoviePreview {
   }
 
   showPlace() {
-    const step = this.about?.frame_time_s;
+    const step = this.about?.time_stamps ? null : this.about?.frame_time_s;
     const text = `Frame ${count(this.frame)} of 0–${count(this.frames - 1)}${step ? ` · ${duration(this.frame * step)}` : ""}`;
     setText(this.place, text);
     setAttribute(this.slider, "aria-valuetext", text);

@@ -36,7 +36,9 @@ export class SeriesPanel {
     /** @type {Range | null} */
     this.view = null;
     this.absolute = false;
-    this.rate = this.waiting = 0;
+    /** @type {Found | null} */
+    this.whole = null; // a series of all frames: their times
+    this.waiting = 0;
     this.unit = this.timeUnit = "";
     const chart = (/** @type {string} */ id, /** @type {string} */ label, /** @type {number} */ height) => lineChart(at(id), {
       label, height, group: "series", empty: "Click a column on the map, or in the table", onRange: (range) => this.zoomed(range),
@@ -74,6 +76,7 @@ export class SeriesPanel {
     try {
       /** @type {Found[]} */
       const came = await Promise.all(ids.map((id) => get(`/jobs/${this.job}/results/series/${id}`, { points: POINTS, ...wanted })));
+      if (!("start" in wanted)) this.whole = came[0] ?? this.whole;
       for (const one of came) if (this.ids.includes(one.column_id)) this.found.set(one.column_id, one);
     } catch (error) { toast(error); }
     this.draw();
@@ -81,9 +84,10 @@ export class SeriesPanel {
 
   /** Frames of the part of time that is seen; nothing where all is. */
   span() {
-    if (!this.view || !this.rate) return {};
-    const start = Math.max(0, Math.floor(this.view[0] / this.rate) - 1);
-    return { start, stop: Math.max(start + 2, Math.ceil(this.view[1] / this.rate) + 2) };
+    if (!this.view || !this.whole) return {};
+    const [first, last] = this.view, { t, frame, frames_per_point: step } = this.whole;
+    const before = t.filter((time) => time < first).length, until = t.filter((time) => time <= last).length;
+    return { start: frame[Math.max(0, before - 1)], stop: frame[Math.min(until, frame.length - 1)] + step };
   }
 
   /** @param {Range | null} range */
@@ -105,10 +109,10 @@ export class SeriesPanel {
    * What the movie is.
    * @param {Summary} summary
    */
-  about({ frames, frame_time_s: time, unit, time_unit: timeUnit }) {
-    [this.rate, this.unit, this.timeUnit] = [time ?? 1, unit, timeUnit];
+  about({ last_time: last, unit, time_unit: timeUnit }) {
+    [this.unit, this.timeUnit] = [unit, timeUnit];
     /** @type {Range} */
-    const xRange = [0, Math.max(frames.total - 1, 1) * this.rate];
+    const xRange = [0, last || 1];
     for (const chart of Object.values(this.charts)) chart.update({ xRange, formatX: (value) => `${significant(value, 6)} ${timeUnit}` });
   }
 
