@@ -2,18 +2,23 @@
 
 import io
 import json
+import os
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import zarr
 from fastapi.testclient import TestClient
+from files_classic import mrc
+from files_dm import write_director
+from files_stamped import write_mib, write_seq
 from serviced import FRAMES, URL, make_app, make_root
 
 from tract_dask.errors import MissingSourceError, TractError
 from tract_dask.progress import ShardDone, StageStarted
-from tract_dask.readers import open_source
-from tract_dask.readers.listing import FileList
+from tract_dask.readers import READERS, merlin, open_source
+from tract_dask.readers.listing import FileList, list_files
 from tract_dask.service.data_root import Bounds, DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.outputs import Mark
@@ -330,3 +335,85 @@ def turned(root: Path, kind: str, target: Path) -> str:
     (root / "turned.npy").unlink(missing_ok=True)
     (root / "turned.npy").symlink_to(target / "frames.npy")
     return "turned.npy"
+
+
+def companions(root: Path) -> dict[str, str]:
+    """Movies, and the names beside them that their readers look for."""
+    frames = np.arange(256, dtype="i2").reshape(4, 8, 8)
+    mrc(root / "m.mrc", frames, 1)
+    mrc(root / "n.mrc", frames, 1)
+    (root / "n.mrc.mdoc").write_text("PixelSpacing = 2\n[FrameSet = 0]\nGainReference = gain.mrc\n")
+    write_mib(root / "k.mib", frames.astype("u2"))
+    write_seq(root / "q.seq", frames.astype("u2"))
+    (root / "insitu").mkdir()
+    write_director(root / "insitu" / "d.dm4", frames.astype("u2"))
+    (root / "insitu" / "d.raw").unlink()
+    (root / "folder").mkdir()
+    zarr.create_array(root / "z.zarr", data=frames, chunks=(1, 8, 8))
+    return {
+        "m.mrc.mdoc": "m.mrc",
+        "m_info.txt": "m.mrc",
+        "gain.mrc": "n.mrc",
+        "k.hdr": "k.mib",
+        "q.dark.mrc": "q.seq",
+        "insitu/d.raw": "insitu/d.dm4",
+        "folder/zarr.json": "folder",
+        "folder/hour_01": "folder",
+        "z.zarr/.zattrs": "z.zarr",
+    }
+
+
+def test_nobody_learns_from_links_beside_a_movie_what_there_is_outside(api, root):
+    outside = root.parent / "secret"
+    for name, movie in companions(root).items():
+        (root / name).symlink_to(outside)
+        answers = []
+        for there in (False, True):
+            if there:
+                outside.write_text("HDR,\n")
+            answers.append({kind: status for kind, (status, _) in ask_everywhere(api, movie).items() if kind != "jobs"})
+        (root / name).unlink()
+        outside.unlink()
+        assert answers[0] == answers[1], name
+
+
+def test_a_pipe_inside_of_a_store_is_not_waited_for(api, root):
+    zarr.create_array(root / "z.zarr", data=np.ones((4, 8, 8), "u1"), chunks=(1, 8, 8))
+    os.mkfifo(root / "z.zarr" / ".zattrs")  # Zarr would open it
+    assert {status for status, _ in ask_everywhere(api, "z.zarr").values()} == {403}
+
+
+def test_a_store_with_folders_that_cannot_be_listed_is_refused_in_words(api, root, monkeypatch):
+    zarr.create_array(root / "z.zarr", data=np.ones((4, 8, 8), "u1"), chunks=(1, 8, 8))
+    assert {status for status, _ in ask_everywhere(api, "z.zarr").values()} <= {200, 201}  # pictures, too
+    (root / "z.zarr" / "loop").symlink_to(root / "z.zarr" / "loop")
+    assert {status for status, _ in ask_everywhere(api, "z.zarr").values()} == {400}
+    (root / "z.zarr" / "loop").unlink()
+    monkeypatch.setattr("tract_dask.service.data_root.MOST_NAMES", 3)
+    for status, text in ask_everywhere(api, "z.zarr").values():
+        assert status == 400
+        assert "too many files and folders" in text
+
+
+def test_long_metadata_of_stores_are_not_read_for_a_listing(api, root, monkeypatch):
+    for name, size in (("long.zarr", 1 << 19), ("short.zarr", 1)):
+        (root / name).mkdir()
+        (root / name / "zarr.json").write_text(json.dumps({"node_type": "group", "attributes": {"x": "y" * size}}))
+    parsed = []
+    look = metadata.attributes
+    monkeypatch.setattr(metadata, "attributes", lambda path: parsed.append(path.name) or look(path))
+    found = {entry["name"]: entry["kind"] for entry in api.get("files").json()["entries"]}
+    assert (found["long.zarr"], found["short.zarr"], parsed) == ("movie", "movie", ["short.zarr"])
+
+
+def test_headers_beside_many_files_cost_one_look_at_their_folder(root, monkeypatch):
+    for k in range(50):
+        (root / "sub" / f"a{k}x.hdr").write_text("HDR")
+        (root / "sub" / f"A{k}x_{k:06}.mib").write_text("MQ1")
+    (root / "sub" / "other.npy").unlink()
+    looks = []
+    names = merlin._names
+    monkeypatch.setattr(merlin, "_names", lambda beside: looks.append(beside) or names(beside))
+    found = list_files("sub", root / "sub", READERS)
+    assert found is not None
+    assert ({file.suffix for file in found.files}, len(found.files), len(looks)) == ({".mib"}, 50, 1)

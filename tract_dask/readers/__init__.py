@@ -23,11 +23,11 @@ from .dectris import is_part
 from .eer import open_eer
 from .hdf5 import open_hdf5
 from .listing import FileList, is_pattern, list_files
-from .merlin import is_header_of_mib, open_merlin
+from .merlin import headers_of_mibs, open_merlin
 from .mrc import open_mrc
 from .npy import open_npy
 from .recipes import unknown_format
-from .registry import Reader, by_suffix
+from .registry import Reader, by_suffix, one_by_one
 from .selection import overridden, select
 from .seq import belongs_to_seq, open_seq
 from .sequence import SequenceSource, open_sequence
@@ -55,21 +55,25 @@ __all__ = [
 BUILT_IN = (
     Reader("TIFF", (".tif", ".tiff", ".stk"), open_tiff),
     Reader("EER", (".eer",), open_eer, inside="how many readouts are summed into a frame"),
-    Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc, is_part=belongs_to_seq),
+    Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc, parts=one_by_one(belongs_to_seq)),
     Reader("NumPy", (".npy",), open_npy),
     Reader(
-        "HDF5", (".h5", ".hdf5", ".hspy", ".emd", ".nxs"), open_hdf5, inside="the path of a data set", is_part=is_part
+        "HDF5",
+        (".h5", ".hdf5", ".hspy", ".emd", ".nxs"),
+        open_hdf5,
+        inside="the path of a data set",
+        parts=one_by_one(is_part),
     ),
     Reader("Zarr", (".zarr", ".zspy"), open_zarr, inside="the path of an array", is_movie=is_zarr),
     Reader("video", video.SUFFIXES, video.open_video),
-    Reader("TIA", (".ser", ".emi"), open_tia, is_part=is_emi),
-    Reader("TVIPS", (".tvips",), open_tvips, is_part=is_later_part),
+    Reader("TIA", (".ser", ".emi"), open_tia, parts=one_by_one(is_emi)),
+    Reader("TVIPS", (".tvips",), open_tvips, parts=one_by_one(is_later_part)),
     Reader("StreamPix", (".seq",), open_seq),
-    Reader("Merlin", (".mib", ".hdr"), open_merlin, is_part=is_header_of_mib),
+    Reader("Merlin", (".mib", ".hdr"), open_merlin, parts=headers_of_mibs),
     Reader(
         "DigitalMicrograph", gatan.SUFFIXES, gatan.open_gatan, inside="the number of an image", is_movie=gatan.is_movie
     ),
-    Reader("raw", (".raw", ".bin", ".dat"), gatan.open_raw_or_movie, is_part=gatan.is_part),
+    Reader("raw", (".raw", ".bin", ".dat"), gatan.open_raw_or_movie, parts=one_by_one(gatan.is_part)),
 )
 """The formats that are read here."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..errors import SourceError
 from . import direct_electron, mdoc
-from .source import NOTHING_KNOWN, Permit, SourceMetadata, checked_file
+from .source import NOTHING_KNOWN, Permit, SourceMetadata, checked_file, is_named, lies_there
 
 _MOST_BYTES = 64 << 20
 """A text file of headers is no longer; 100,000 sections of SerialEM take half of it."""
@@ -25,11 +25,11 @@ def known_beside(path: Path, n_frames: int, permit: Permit | None) -> SourceMeta
     """
     known = NOTHING_KNOWN
     for file in _mdoc_names(path):
-        if file.is_file():
+        if lies_there(file, permit):
             known = _found(mdoc.parse(_text(file, permit), n_frames, file.name), path)
             break
     for file in _info_names(path):
-        if file.is_file():
+        if lies_there(file, permit):
             known = merged(known, direct_electron.parse(_text(file, permit), path.stem, n_frames, file.name), file.name)
             break
     return known
@@ -37,7 +37,7 @@ def known_beside(path: Path, n_frames: int, permit: Permit | None) -> SourceMeta
 
 def info_text(path: Path, permit: Permit | None) -> str:
     """Return the text of Direct Electron's file beside a movie; empty where there is none."""
-    return next((_text(file, permit) for file in _info_names(path) if file.is_file()), "")
+    return next((_text(file, permit) for file in _info_names(path) if lies_there(file, permit)), "")
 
 
 def merged(first: SourceMetadata, second: SourceMetadata, where: str) -> SourceMetadata:
@@ -70,13 +70,13 @@ def merged(first: SourceMetadata, second: SourceMetadata, where: str) -> SourceM
 
 def _found(known: SourceMetadata, path: Path) -> SourceMetadata:
     """Return what is known with the references that lie beside the movie, and a note on each that frames lack."""
-    there = {kind: path.with_name(name.name) for kind, name in known.references.items()}
+    named = {kind: path.with_name(name.name) for kind, name in known.references.items()}
+    found = {kind: file for kind, file in named.items() if is_named(file)}
     notes = tuple(
         f"{path.name}: the camera's {kind} reference was not applied; it is {file.name},"
-        f" which {'lies next to it' if file.is_file() else 'is not there'}"
-        for kind, file in there.items()
+        f" which {'lies next to it' if kind in found else 'is not there'}"
+        for kind, file in named.items()
     )
-    found = {kind: file for kind, file in there.items() if file.is_file()}
     return replace(known, references=found, notes=(*known.notes, *notes))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import replace
 from itertools import pairwise
@@ -34,7 +35,7 @@ def is_part(path: Path) -> bool:
     """Tell whether a file belongs to a master file beside it: data, or a microscope's metadata."""
     found = _FILE.fullmatch(path.name)
     stem = found["stem"] if found else path.stem
-    return any((path.parent / f"{stem}_master{suffix}").exists() for suffix in (".h5", ".hdf5"))
+    return any(os.path.lexists(path.parent / f"{stem}_master{suffix}") for suffix in (".h5", ".hdf5"))
 
 
 def master_metadata(file: Any, names: list[str], n_frames: int, path: Path) -> SourceMetadata:

@@ -83,7 +83,7 @@ def director_of(path: Path) -> Path | None:
     """Return the file that may direct a ``.raw`` file: of its name, beside it; None where there is none."""
     if path.suffix.lower() != ".raw":
         return None
-    return next((file for end in _DIRECTORS if (file := path.with_suffix(end)).exists()), None)
+    return next((file for end in _DIRECTORS if os.path.lexists(file := path.with_suffix(end))), None)
 
 
 def is_part(path: Path) -> bool:
@@ -94,12 +94,18 @@ def is_part(path: Path) -> bool:
 def is_movie(folder: Path) -> bool:
     """Tell whether a folder holds a director with its frames, or folders by hour, minute and second."""
     try:
-        names = {item.name for item in folder.iterdir()}
+        with os.scandir(folder) as found:
+            names = {item.name for item in found}
     except OSError:
         return False  # who opens it is told why
     stems = {name[:-4] for name in names if name.endswith(".raw")}
     directed = any(f"{stem}{end}" in names for stem in stems for end in _DIRECTORS)
-    return directed or any(_level(name) and (folder / name).is_dir() for name in names)
+    return directed or any(_level(name) and _may_be_folder(folder / name) for name in names)
+
+
+def _may_be_folder(place: Path) -> bool:
+    """Tell whether a path is a folder, or a link, which is followed only once it is permitted."""
+    return place.is_symlink() or place.is_dir()
 
 
 def _director_in(folder: Path) -> Path | None:
@@ -124,7 +130,7 @@ def _director_in(folder: Path) -> Path | None:
 def _has_parts(director: Path) -> bool:
     """Tell whether frames lie beside a file, without a look at the whole folder, which may be large."""
     parts = (director.with_suffix(end) for end in (".raw", ".raw_1"))
-    return director.suffix.lower() in _DIRECTORS and any(part.exists() for part in parts)
+    return director.suffix.lower() in _DIRECTORS and any(map(os.path.lexists, parts))
 
 
 def _parts(director: Path) -> tuple[Path, ...]:
@@ -222,9 +228,9 @@ def _below(folder: Path, began: float, level: int, permit: Permit | None) -> Ite
     """Yield the files of the folders by hour, minute and second below a folder, with the second of each."""
     for item in folder.iterdir():
         kind = _level(item.name)
+        if kind and permit is not None:
+            permit(Path(os.path.realpath(item)))
         if kind and _LEVELS.index(kind) >= level and item.is_dir():
-            if permit is not None:
-                permit(Path(os.path.realpath(item)))
             start = began + _SECONDS[kind] * int(item.name.rsplit("_", 1)[1])
             yield from _below(item, start, _LEVELS.index(kind) + 1, permit)
         elif level == len(_LEVELS) and item.suffix.lower() in SUFFIXES and not item.name.startswith("."):

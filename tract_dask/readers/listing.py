@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -100,7 +100,8 @@ def _matching(pattern: Path) -> list[Path]:
 def _readable(folder: Path, readers: Mapping[str, Reader]) -> list[Path]:
     """Return the files of the one readable format in a folder, without those that only belong to another one."""
     there = [file for file in folder.iterdir() if file.suffix.lower() in readers and not file.name.startswith(".")]
-    files = [file for file in there if not _is_part(file, readers)]
+    parts = _parts(there, readers)
+    files = [file for file in there if file not in parts]
     apart = references([file.name for file in files])
     kinds = Counter(file.suffix.lower() for file in files if file.name not in apart)
     if len({readers[kind] for kind in kinds}) > 1:
@@ -116,9 +117,16 @@ def _readable(folder: Path, readers: Mapping[str, Reader]) -> list[Path]:
 
 def _whole(files: list[Path], readers: Mapping[str, Reader]) -> list[Path]:
     """Return files without those that only belong to another one; all where each does."""
-    return [file for file in files if not _is_part(file, readers)] or files
+    parts = _parts(files, readers)
+    return [file for file in files if file not in parts] or files
 
 
-def _is_part(file: Path, readers: Mapping[str, Reader]) -> bool:
-    reader = readers.get(file.suffix.lower())
-    return reader is not None and reader.is_part(file)
+def _parts(files: Sequence[Path], readers: Mapping[str, Reader]) -> set[Path]:
+    """Return which files of a folder only belong to others; each reader is asked once, since folders may be large."""
+    kinds = {file.suffix.lower() for file in files}
+    found = {readers[kind] for kind in kinds if kind in readers}
+    return {
+        part
+        for reader in found
+        for part in reader.parts([file for file in files if file.suffix.lower() in reader.suffixes])
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
 from .merlin_raw import RawLayout, RawSource
-from .source import Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, truncated, untested
+from .source import Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, lies_there, truncated, untested
 from .times import timed_ticks
 from .units import to_seconds
 
@@ -72,9 +72,27 @@ def open_merlin(path: Path, inner: str, settings: SourceSettings, permit: Permit
     return RawSource(**vars(source), layout=layout) if layout else source
 
 
-def is_header_of_mib(path: Path) -> bool:
-    """Tell whether a file is the ``.hdr`` of a ``.mib`` beside it, which opens by itself."""
-    return path.suffix.lower() == ".hdr" and bool(_mib_of(path))
+def headers_of_mibs(files: Iterable[Path]) -> set[Path]:
+    """Return which files of a folder are the ``.hdr`` of a ``.mib`` beside them, which opens by itself."""
+    headers = [file for file in files if file.suffix.lower() == ".hdr"]
+    stems = {stem for name in (_names(headers[0]) if headers else ()) for stem in _header_stems(name)}
+    return {header for header in headers if header.stem.lower() in stems}
+
+
+def _header_stems(name: str) -> Iterator[str]:
+    """Yield how the header of a ``.mib`` file may be named, without its suffix and in lower case.
+
+    Examples
+    --------
+    >>> list(_header_stems("a_12.mib"))
+    ['a_12', 'a_', 'a_1', 'a']
+    """
+    stem, dot, suffix = name.lower().rpartition(".")
+    if suffix == "mib" and dot:
+        bare = stem.rstrip("0123456789")
+        yield stem
+        yield from (stem[:length] for length in range(len(bare), len(stem)))
+        yield bare.removesuffix("_")
 
 
 def _mib_of(header: Path) -> list[Path]:
@@ -111,7 +129,8 @@ def _frames_of(header: Path) -> Path:
 
 def _text_beside(path: Path, permit: Permit | None) -> dict[str, str]:
     """Return what the ``.hdr`` of a file says, line by line; nothing where there is none."""
-    header = next((path.with_suffix(end) for end in (".hdr", ".HDR") if path.with_suffix(end).is_file()), None)
+    names = (path.with_suffix(end) for end in (".hdr", ".HDR"))
+    header = next((file for file in names if lies_there(file, permit)), None)
     if header is None:
         return {}
     checked_file(header, permit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -16,6 +16,15 @@ Opener: TypeAlias = Callable[[Path, str, SourceSettings, Permit | None], Source]
 
 def _never(path: Path) -> bool:
     return False
+
+
+def _none(files: Sequence[Path]) -> set[Path]:
+    return set()
+
+
+def one_by_one(is_part: Callable[[Path], bool]) -> Callable[[Sequence[Path]], set[Path]]:
+    """Return what tells of many files which are parts, from what tells it of one, without a look at its folder."""
+    return lambda files: set(filter(is_part, files))
 
 
 @dataclass(frozen=True)
@@ -34,8 +43,9 @@ class Reader:
         What may follow a path after two colons, in words; empty where nothing may.
     is_movie
         Tells whether a folder is one movie of this format, which ``open`` takes as a whole.
-    is_part
-        Tells whether a file, whose suffix is one of these, only belongs to the movie of another file beside it.
+    parts
+        Takes files of one folder, whose suffixes are these; returns those that only belong to the movie of another file
+        beside them.
     """
 
     name: str
@@ -43,7 +53,7 @@ class Reader:
     open: Opener
     inside: str = ""
     is_movie: Callable[[Path], bool] = _never
-    is_part: Callable[[Path], bool] = _never
+    parts: Callable[[Sequence[Path]], set[Path]] = _none
 
 
 def by_suffix(readers: Iterable[Reader]) -> dict[str, Reader]:

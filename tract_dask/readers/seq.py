@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .source import Permit, SourceMetadata, checked_shape, truncated
+from .source import Permit, SourceMetadata, checked_shape, is_named, truncated
 from .times import timed_ticks
 
 _HEADER_BYTES = 1024
@@ -79,7 +80,8 @@ def belongs_to_seq(path: Path) -> bool:
     lower = path.name.lower()
     ending = next((end for end in (".dark.mrc", ".gain.mrc", ".defects.mrc") if lower.endswith(end)), "")
     stem = path.name[: -len(ending)] if ending else ""
-    return bool(stem) and any(path.with_name(name).exists() for name in (stem, f"{stem}.seq") if name.endswith(".seq"))
+    names = (name for name in (stem, f"{stem}.seq") if stem and name.endswith(".seq"))
+    return any(os.path.lexists(path.with_name(name)) for name in names)
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ def _references(path: Path) -> dict[str, Path]:
     found = {}
     for what, endings in _BESIDE.items():
         names = (path.with_name(f"{stem}{ending}") for ending in endings for stem in (path.stem, path.name))
-        there = next((file for file in names if file.is_file()), None)
+        there = next((file for file in names if is_named(file)), None)
         if there is not None:
             found[what] = there
     return found

@@ -339,6 +339,21 @@ def checked_claim(n_bytes: int, size: int, where: str, what: str = "one frame") 
         )
 
 
+def is_named(file: Path) -> bool:
+    """Tell whether there is a file of this name, or a link, which is not followed: for what is named only."""
+    return file.is_symlink() or file.is_file()
+
+
+def lies_there(file: Path, permit: Permit | None) -> bool:
+    """Tell whether there is a file of a name beside a movie; a link is asked for before it is followed.
+
+    What ``permit`` refuses is refused whether something lies there or not: nobody learns from links what there is.
+    """
+    if permit is not None and file.is_symlink():
+        permit(Path(os.path.realpath(file)))
+    return file.is_file()
+
+
 def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
     """Return the status of a file that may be opened, without opening it: to open a pipe would take forever.
 

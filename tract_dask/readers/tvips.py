@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -73,7 +74,7 @@ def open_tvips(path: Path, inner: str, settings: SourceSettings, permit: Permit 
 def is_later_part(path: Path) -> bool:
     """Tell whether a file only belongs to the movie of the file ``_000`` beside it."""
     split = _PART.fullmatch(path.stem)
-    return split is not None and int(split[2]) > 0 and _first_part(path, split).exists()
+    return split is not None and int(split[2]) > 0 and os.path.lexists(_first_part(path, split))
 
 
 def _first_part(path: Path, split: re.Match[str]) -> Path:

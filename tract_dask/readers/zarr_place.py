@@ -15,7 +15,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore, ZipStore
 
 from ..errors import SourceError
-from .source import Permit, checked_file
+from .source import Permit, checked_file, is_named
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 """Files by which a folder is known to be an array or a group."""
@@ -24,8 +24,8 @@ _MOST_JSON, _MOST_FILES = 16 << 20, 10_000_000
 
 
 def is_zarr(folder: Path) -> bool:
-    """Tell whether a folder is a Zarr array or group."""
-    return any((folder / name).is_file() for name in METADATA)
+    """Tell whether a folder is a Zarr array or group; links are not followed."""
+    return any(is_named(folder / name) for name in METADATA)
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class Place:
             with os.scandir(folder) as found:
                 for item in found:
                     place = os.path.realpath(item.path) if item.is_symlink() else f"{real}/{item.name}"
-                    if self.permit is not None:
-                        self.permit(Path(place))
+                    if self.permit is not None and not item.is_file(follow_symlinks=False):
+                        self.permit(Path(place))  # a file that is no link lies in its folder
                     if not item.is_dir():
                         yield f"{shown}{item.name}", item.stat().st_size
                     elif level < depth:

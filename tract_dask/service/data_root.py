@@ -23,6 +23,7 @@ from ..readers import READERS, is_movie_folder
 from ..readers.listing import WILD, FileList, list_files
 from ..readers.recipes import unknown_format
 from ..store import metadata
+from ..store.damage import METADATA
 
 T = TypeVar("T")
 
@@ -37,6 +38,9 @@ MOST_NAMES = 1_000_000
 
 MAX_NAME_BYTES = 255
 MAX_PATH_BYTES = 2048
+
+_LISTED_BYTES = 1 << 18
+"""Metadata of a store that are read for a listing; ours have a tenth of that."""
 
 STORES = (".zarr", ".zspy")
 """Suffixes of folders that are shown as one thing: a movie, or another store."""
@@ -266,18 +270,48 @@ class DataRoot:
         ------
         OutsideError
             Where one does.
+        InputError
+            Where it holds more than :data:`MOST_NAMES` files and folders, or one cannot be looked at.
         """
-        seen, waiting = {folder}, [folder]
-        while waiting:
-            with os.scandir(waiting.pop()) as found:
-                items = list(found)
-            for item in items:
-                place = Path(os.path.realpath(item.path)) if item.is_symlink() else Path(item.path)
-                if item.is_symlink():
-                    self.permit(place)
-                if item.is_dir() and place not in seen:
-                    seen.add(place)
-                    waiting.append(place)
+        seen, waiting, looked = {folder}, [folder], 0
+        try:
+            while waiting:
+                with os.scandir(waiting.pop()) as found:
+                    for item in found:
+                        looked += 1
+                        if looked > MOST_NAMES:
+                            raise self._crowded(folder)
+                        place = self._below(item)
+                        if place is not None and place not in seen:
+                            seen.add(place)
+                            waiting.append(place)
+        except OSError as error:
+            got = error.strerror or str(error)
+            remedy = "Check the permissions and the depth of its folders, or make the copy again"
+            raise InputError(
+                "a folder in it cannot be listed", self.relative(folder), "files and folders", got, remedy
+            ) from error
+
+    def _crowded(self, folder: Path) -> InputError:
+        return InputError(
+            "there are too many files and folders in it",
+            self.relative(folder),
+            f"at most {MOST_NAMES}",
+            "more",
+            "Convert the movie with tract-dask convert, or store it with larger chunks or shards",
+        )
+
+    def _below(self, item: os.DirEntry[str]) -> Path | None:
+        """Return the folder that an entry of a folder is, or leads to; None where it is none."""
+        if item.is_symlink():
+            place = Path(os.path.realpath(item.path))
+            self.permit(place)
+            return place if place.is_dir() else None
+        if item.is_dir():
+            return Path(item.path)
+        if not item.is_file():
+            self.permit(Path(item.path))  # a pipe, which a library would wait for
+        return None
 
     def shown(self, value: T) -> T:
         """Return a text, or a JSON value with texts in it, as users are to see it: paths relative to the root."""
@@ -392,12 +426,24 @@ def _kind(place: Path, is_folder: bool) -> str:
     if is_folder and place.suffix.lower() not in STORES:
         return "folder"
     if is_folder:
-        try:
-            kind = metadata.attributes(place).get("kind")
-            return "movie" if kind == "movie" or (kind is None and is_movie_folder(place)) else "file"
-        except StoreError:  # a damaged store does not keep others from being listed
-            return "file"
+        return "movie" if _is_movie_store(place) else "file"
     return "movie" if place.suffix.lower() in READERS else "file"
+
+
+def _is_movie_store(place: Path) -> bool:
+    """Tell whether a store holds a movie; damaged ones do not, and of long metadata, none of which are ours, all do.
+
+    A page may have thousands of stores: what would take long to parse is not read, and no link is followed.
+    """
+    file = place / METADATA
+    try:
+        status = file.lstat() if os.path.lexists(file) else None
+        if status is not None and (stat.S_ISLNK(status.st_mode) or status.st_size > _LISTED_BYTES):
+            return is_movie_folder(place)
+        kind = metadata.attributes(place).get("kind")
+    except (StoreError, OSError):  # a damaged store does not keep others from being listed
+        return False
+    return kind == "movie" or (kind is None and is_movie_folder(place))
 
 
 def folded(path: str) -> tuple[str, ...]:

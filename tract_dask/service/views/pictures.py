@@ -30,6 +30,7 @@ from ...readers.listing import FileList
 from ...readers.source import Permit, SourceMetadata
 from ...settings.run import MetadataSettings, SourceSettings
 from ...store import datasets
+from ...store.metadata import attributes
 from ...store.movie import Movie, open_movie
 from ...store.run_folder import RunFolder
 
@@ -161,7 +162,8 @@ def sum_levels(folder: Path, view: View, stamp: str) -> bytes:
 
 
 def _is_converted(path: str | FileList) -> bool:
-    return isinstance(path, str) and path.endswith(".zarr")
+    """Tell whether a movie is a store of ours, and not a Zarr array of others."""
+    return isinstance(path, str) and path.endswith(".zarr") and bool(attributes(Path(path)))
 
 
 def source_plane(frame: MovieFrame) -> Plane:
