@@ -14,6 +14,8 @@ from files_hdf5 import FRAMES, emd, hyperspy, nexus, velox
 
 from tract_dask.errors import SourceError
 from tract_dask.readers import FrameSource, open_source
+from tract_dask.stages.convert.stage import convert
+from tract_dask.store.movie import open_movie
 
 LAST = FRAMES.transpose(1, 2, 0)
 MIRROR = FRAMES.transpose(2, 1, 0)
@@ -139,6 +141,14 @@ def test_times_of_an_axis_with_lost_frames(tmp_path: Path) -> None:
     assert found.frame_time_s == 0.5
     np.testing.assert_array_equal(found.along_frames["time"].values, times - 7)
     assert "gap of 1.5 s after frame 2" in found.notes[0]
+
+
+def test_times_of_a_fast_camera_keep_their_gap_in_the_store(tmp_path: Path) -> None:
+    times = np.array([0, 1, 2, 5, 6]) / 7500
+    frames = np.zeros((5, 64, 64), "u2")
+    place = nexus(tmp_path / "a.nxs", frames, ["t", "y", "x"], t=(times, "s"))
+    movie = open_movie(convert(place, tmp_path / "movie.zarr"))
+    np.testing.assert_allclose(movie.times(), times, rtol=0, atol=1e-11)
 
 
 REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {

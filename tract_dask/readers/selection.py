@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from ..errors import SettingsError
 from ..settings.run import SourceSettings
 from .source import Frames, FrameValues, Part, Source, SourceMetadata
+from .times import usual_step
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,16 +199,25 @@ def _metadata(
     }
     if "time" in along:
         times = along["time"]
-        along["time"] = FrameValues(times.values - times.values[0], times.units)
-    pixel, seconds = known.pixel_size_pm, known.frame_time_s
+        along["time"] = FrameValues(np.round(times.values - times.values[0], 12), times.units)
+    pixel = known.pixel_size_pm
     return replace(
         known,
         pixel_size_pm=pixel and pixel * settings.bin,
-        frame_time_s=seconds and seconds * frames.step,
+        frame_time_s=_frame_time(known, along, frames.step),
         notes=(*known.notes, *_said(frames, field, settings, shape)),
         along_frames=along,
         part=Part(frames.start, frames.step, field[0], field[2], settings.bin),
     )
+
+
+def _frame_time(known: SourceMetadata, along: dict[str, FrameValues], step: int) -> float | None:
+    """Return the frame time of a part: the median step of its time stamps, where that of the movie is theirs, too."""
+    seconds = known.frame_time_s
+    if seconds is None or "time" not in along or len(along["time"].values) < 2:
+        return seconds and seconds * step
+    by_stamps = math.isclose(usual_step(known.along_frames["time"].values), seconds, rel_tol=1e-6)
+    return usual_step(along["time"].values) if by_stamps else seconds * step
 
 
 def _said(

@@ -53,13 +53,25 @@ def timed_ticks(ticks: NDArray[np.int64], per_second: int, where: str) -> Source
 def _course(stamps: NDArray[np.float64], start_s: float, where: str) -> SourceMetadata:
     if len(stamps) < 2:
         return SourceMetadata(start_s=start_s if np.isfinite(stamps).all() else None)
-    steps = np.diff(stamps)
-    if not np.isfinite(stamps).all() or not (steps > 0).all():
+    since = np.round(stamps - stamps[0], 12)
+    steps = np.diff(since)
+    if not np.isfinite(since).all() or not (steps > 0).all():
         return SourceMetadata(notes=_unfit(steps, where))
-    usual = float(f"{np.median(steps):.9g}")
-    along = {"time": FrameValues(np.round(stamps - stamps[0], 9), "s")}
+    usual = usual_step(since)
+    along = {"time": FrameValues(since, "s")}
     notes = _gaps(steps, usual, where)
     return SourceMetadata(frame_time_s=usual, notes=notes, start_s=start_s, along_frames=along)
+
+
+def usual_step(times_s: NDArray[np.float64]) -> float:
+    """Return the median step between the times of two frames or more, in s.
+
+    Examples
+    --------
+    >>> usual_step(np.array([0, 0.04, 0.08, 0.2]))
+    0.04
+    """
+    return float(f"{np.median(np.diff(times_s)):.9g}")
 
 
 def _unfit(steps: NDArray[np.float64], where: str) -> tuple[str, ...]:
