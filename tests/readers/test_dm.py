@@ -124,6 +124,7 @@ def test_a_thumbnail_that_no_tag_names_is_not_the_movie(tmp_path: Path) -> None:
         ([(0.2, "Å"), (0.2, "Å"), (20.0, "µs")], 20, 2e-5, ""),
         ([(0.001, "µm"), (0.002, "µm"), (1.0, "")], 1000, None, "not square"),
         ([(-0.1, "nm"), (0.1, "nm"), (2.0, "nm")], 100, None, "its frames are 2 nm apart, which is not a frame time"),
+        ([(0.1, "nm"), (0.1, "nm"), (0.5, "")], 100, None, "its frames are 0.5 (no unit) apart"),
         ([(0.01, "1/nm"), (0.01, "1/nm"), (1.0, "sec")], None, 1, "calibrated in 1/nm, which is not a length"),
         ([(0.1, "nm"), (1.0, "")], 100, None, "only one of x and y is calibrated"),
         ([(0.0, "nm"), (0.0, "nm")], None, None, "a pixel of 0 nm is impossible"),

@@ -143,6 +143,23 @@ def test_times_of_an_axis_with_lost_frames(tmp_path: Path) -> None:
     assert "gap of 1.5 s after frame 2" in found.notes[0]
 
 
+@pytest.mark.parametrize(
+    ("unit", "scale", "said"),
+    [
+        ("", 0.5, "along time is 0.5 without a unit"),
+        ("frames", 0.5, "along time is 0.5 frames"),
+        ("deg", 1.0, "along time is 1 deg"),
+        ("frames", 1.0, ""),
+        ("", 1.0, ""),
+        ("ms/frame", 40.0, ""),
+    ],
+)
+def test_a_step_between_frames_that_is_no_time_is_said(unit: str, scale: float, said: str, tmp_path: Path) -> None:
+    known = open_source(hyperspy(tmp_path / "a.hspy", FRAMES, [("time", unit, scale, True), Y, X])).metadata
+    assert known.frame_time_s == (0.04 if unit.startswith("ms") else None)
+    assert [said in note for note in known.notes] == [True] * bool(said)
+
+
 def test_times_of_a_fast_camera_keep_their_gap_in_the_store(tmp_path: Path) -> None:
     times = np.array([0, 1, 2, 5, 6]) / 7500
     frames = np.zeros((5, 64, 64), "u2")

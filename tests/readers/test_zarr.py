@@ -128,6 +128,7 @@ def test_several_arrays_are_listed(tmp_path: Path) -> None:
     ("shape", "axes", "words"),
     [
         ((3, 2, 1, 40, 36), FIVE, "several channels"),
+        ((3, 40, 36), [{"name": "detector", "type": "channel"}, *YX], "several channels"),
         ((3, 1, 2, 40, 36), FIVE, r"4 axes.*axes t \(second\), z"),
         ((4, 40, 36), [{"name": "energy", "unit": "eV"}, *YX], "spectrum"),
     ],

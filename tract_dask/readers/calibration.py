@@ -37,7 +37,18 @@ def _times(axis: Axis, where: str) -> SourceMetadata:
     second = to_seconds(1.0, unit)
     if second and axis.values is not None and len(axis.values) > 1:
         return timed(axis.values * second, Path(where.partition("::")[0]).name)
-    return SourceMetadata(frame_time_s=to_seconds(axis.scale, unit))
+    seconds = to_seconds(axis.scale, unit)
+    return SourceMetadata(frame_time_s=seconds, notes=_no_time(axis, unit, where) if seconds is None else ())
+
+
+def _no_time(axis: Axis, unit: str, where: str) -> tuple[str, ...]:
+    """Return a note where the axis of the frames is calibrated, but not in a unit of time."""
+    step = axis.scale if math.isfinite(axis.scale) else 1.0
+    if unit.lower() in (*_NO_UNITS, "frame", "frames") and step in (0.0, 1.0):
+        return ()
+    named = f"along {axis.name}" if axis.name else "of its frames"
+    what = f"{step:.6g} {unit}" if unit else f"{step:.6g} without a unit"
+    return (f"{where}: the step {named} is {what}, which is not a time; the frame time is not known",)
 
 
 DECLARED = ("pixel_size_", "frame_time_")
