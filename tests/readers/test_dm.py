@@ -170,6 +170,17 @@ def stamped(seconds: float) -> dict[str, Any]:
     return {"DataBar": {"Acquisition Time (OS)": 1.31e17 + 1e7 * seconds, "Exposure Time (s)": 0.1}} | tilt
 
 
+@pytest.mark.parametrize("silent", [0, 4])
+def test_a_file_without_a_time_stamp_among_others_is_named(silent: int, tmp_path: Path) -> None:
+    for k in range(5):
+        write_dm(tmp_path / f"f_{k}.dm4", FRAMES[k], LENGTHS, None if k == silent else stamped(0.5 * k))
+    known = open_source(tmp_path).metadata
+    assert list(known.along_frames) == ["stage_tilt"]
+    tilts = [np.nan if k == silent else 0.05 * k for k in range(5)]
+    np.testing.assert_allclose(known.along_frames["stage_tilt"].values, tilts)
+    assert any(f"f_{silent}.dm4 does not say when it was taken, other files do" in note for note in known.notes)
+
+
 def test_a_folder_of_single_frames_has_the_times_of_its_files(tmp_path: Path) -> None:
     moments = [0.0, 0.5, 1.0, 2.5, 3.0]
     for k, moment in enumerate(moments):

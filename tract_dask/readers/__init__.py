@@ -34,6 +34,7 @@ from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tia import is_emi, open_tia
 from .tiff import open_tiff
+from .times import agreed
 from .tvips import is_later_part, open_tvips
 from .zarr_arrays import open_zarr
 from .zarr_place import is_zarr
@@ -139,14 +140,14 @@ def open_source(
     name = next(iter(place), "an empty list") if isinstance(place, list) else str(place)
     with reading(name):
         source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
-    known = source.metadata
+    known = agreed(source.metadata, Path(name).name)
     merged = replace(
         known,
         pixel_size_pm=known.pixel_size_pm if metadata.pixel_size_pm is None else metadata.pixel_size_pm,
         frame_time_s=known.frame_time_s if metadata.frame_time_s is None else metadata.frame_time_s,
         dose=known.dose if metadata.dose is None else metadata.dose,
         gain=metadata.gain,
-        notes=known.notes + _not_applied(known),
+        notes=known.notes + _not_applied(known) + _given(known, metadata),
     )
     listed = tuple(place) if isinstance(place, list) else ()
     return select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
@@ -159,6 +160,14 @@ def _not_applied(known: SourceMetadata) -> tuple[str, ...]:
         for kind, file in known.references.items()
         if kind != "metadata" and not any(file.name in note for note in known.notes)
     )
+
+
+def _given(known: SourceMetadata, metadata: MetadataSettings) -> tuple[str, ...]:
+    """Return a note where the user's frame time replaces the time stamps of the frames."""
+    given = metadata.frame_time_s
+    if given is None or "time" not in known.along_frames or known.frame_time_s in (None, given):
+        return ()
+    return (f"the time stamps are {known.frame_time_s:.6g} s apart; the given frame time, {given:.6g} s, is used",)
 
 
 def open_cached(

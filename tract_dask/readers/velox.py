@@ -51,7 +51,10 @@ def velox_metadata(dataset: Any, where: str) -> SourceMetadata:
         how += (
             f"{where}: the time stamps of the first {len(said)} frames give the frame time; the others were not read",
         )
-    along = _along(said) | dict(times.along_frames) if every else {}
+    along = _along(said)
+    if along and not every:
+        how += (f"{where}: {', '.join(along)} of the first {len(said)} frames were read only; they are not kept",)
+    along = along | dict(times.along_frames) if every else {}
     return SourceMetadata(pixel, seconds, notes=(*notes, *how), along_frames=along, start_s=times.start_s)
 
 
