@@ -11,6 +11,7 @@ from typing import Any
 import numcodecs
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 from files_hdf5 import FRAMES, array, ome, zipped, zspy
 from test_reader_fuzz import mutated
@@ -272,3 +273,11 @@ def test_mutated_stores_give_frames_or_one_of_our_errors(version: int, tmp_path:
             assert "a.zarr" in str(error)  # noqa: PT017 - most of them open
         file.write_bytes(whole)
     assert opened >= 10
+
+
+def test_times_since_a_moment_as_xarray_writes_them(tmp_path: Path) -> None:
+    moments = np.datetime64("2026-01-01") + np.array([0, 40, 80, 200, 240]) * np.timedelta64(1, "ms")
+    xr.Dataset({"movie": (("time", "y", "x"), FRAMES)}, {"time": moments}).to_zarr(tmp_path / "a.zarr", zarr_format=2)
+    known = open_source(tmp_path / "a.zarr").metadata
+    assert known.frame_time_s == 0.04
+    np.testing.assert_allclose(known.along_frames["time"].values, [0, 0.04, 0.08, 0.2, 0.24])

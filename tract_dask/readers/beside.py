@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..errors import SourceError
 from . import direct_electron, mdoc
-from .source import NOTHING_KNOWN, Permit, SourceMetadata, checked_file
+from .source import NOTHING_KNOWN, Permit, SourceMetadata, checked_file, holds_something
 
 _MOST_BYTES = 64 << 20
 """A text file of headers is no longer; 100,000 sections of SerialEM take half of it."""
@@ -25,11 +25,11 @@ def known_beside(path: Path, n_frames: int, permit: Permit | None) -> SourceMeta
     """
     known = NOTHING_KNOWN
     for file in _mdoc_names(path):
-        if file.is_file():
+        if holds_something(file):
             known = _found(mdoc.parse(_text(file, permit), n_frames, file.name), path)
             break
     for file in _info_names(path):
-        if file.is_file():
+        if holds_something(file):
             known = merged(known, direct_electron.parse(_text(file, permit), path.stem, n_frames, file.name), file.name)
             break
     return known
@@ -37,7 +37,7 @@ def known_beside(path: Path, n_frames: int, permit: Permit | None) -> SourceMeta
 
 def info_text(path: Path, permit: Permit | None) -> str:
     """Return the text of Direct Electron's file beside a movie; empty where there is none."""
-    return next((_text(file, permit) for file in _info_names(path) if file.is_file()), "")
+    return next((_text(file, permit) for file in _info_names(path) if holds_something(file)), "")
 
 
 def merged(first: SourceMetadata, second: SourceMetadata, where: str) -> SourceMetadata:

@@ -14,7 +14,16 @@ from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
 from .merlin_raw import RawLayout, RawSource
-from .source import Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, truncated, untested
+from .source import (
+    Permit,
+    SourceMetadata,
+    checked_dtype,
+    checked_file,
+    checked_shape,
+    holds_something,
+    truncated,
+    untested,
+)
 from .times import timed_ticks
 from .units import to_seconds
 
@@ -111,7 +120,7 @@ def _frames_of(header: Path) -> Path:
 
 def _text_beside(path: Path, permit: Permit | None) -> dict[str, str]:
     """Return what the ``.hdr`` of a file says, line by line; nothing where there is none."""
-    header = next((path.with_suffix(end) for end in (".hdr", ".HDR") if path.with_suffix(end).is_file()), None)
+    header = next((path.with_suffix(end) for end in (".hdr", ".HDR") if holds_something(path.with_suffix(end))), None)
     if header is None:
         return {}
     checked_file(header, permit)

@@ -170,7 +170,7 @@ def _times(known: Sequence[SourceMetadata], lengths: Sequence[int], where: str) 
 
 
 def _values(name: str, known: Sequence[SourceMetadata], lengths: Sequence[int]) -> FrameValues:
-    """Return the values of all files' frames; NaN where a file does not have them in the units of the first that does."""
+    """Return the values of all files' frames; NaN where a file lacks them in the first one's units."""
     units = next(part.along_frames[name].units for part in known if name in part.along_frames)
     parts = [part.along_frames.get(name) for part in known]
     return FrameValues(

@@ -372,6 +372,11 @@ def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
     return status
 
 
+def holds_something(file: Path) -> bool:
+    """Tell whether a file beside a movie is there and not empty: an empty one says nothing, and hinders nobody."""
+    return file.is_file() and file.stat().st_size > 0
+
+
 _KINDS: dict[Callable[[int], bool], str] = {
     stat.S_ISDIR: "a folder",
     stat.S_ISFIFO: "a pipe",

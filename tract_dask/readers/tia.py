@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .source import Frames, Permit, SourceMetadata, checked_dtype, checked_file, checked_shape, truncated
+from .source import (
+    Frames,
+    Permit,
+    SourceMetadata,
+    checked_dtype,
+    checked_file,
+    checked_shape,
+    holds_something,
+    truncated,
+)
 from .tia_header import Head, tia_head
 from .times import timed_ticks
 from .units import square_pixel, to_pm, to_seconds
@@ -237,8 +246,9 @@ def _step_of(head: Head) -> float | None:
 def _frame_time(path: Path, permit: Permit | None) -> float | None:
     """Return the time of a frame in seconds that the ``.emi`` beside a series has, where it has one."""
     emi = path.with_name(re.sub(r"_\d+$", "", path.stem) + ".emi")
-    if not emi.is_file() or not checked_file(emi, permit).st_size:
+    if not holds_something(emi):
         return None
+    checked_file(emi, permit)
     with emi.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         times = {bytes(found[1]) for found in re.finditer(rb"<FrameTime>([0-9.eE+-]{1,30})</FrameTime>", data)}
     try:
