@@ -311,7 +311,7 @@ def test_damaged_texts_of_velox_are_a_note(tmp_path: Path) -> None:
         file["Data/Image/a1/Metadata"][:100] = 7
     source = open_source(path)
     same(source)
-    assert "calibration cannot be read" in source.metadata.notes[0]
+    assert "Velox's metadata are damaged" in source.metadata.notes[0]
 
 
 def test_values_that_are_to_be_scaled_are_noted(tmp_path: Path) -> None:
@@ -340,3 +340,15 @@ def test_a_heap_of_texts_without_an_end(tmp_path: Path) -> None:
     whole[at : at + 400] = bytes(400)
     path.write_bytes(whole)
     fails(path, "the texts in the file are damaged")
+
+
+@pytest.mark.parametrize("damaged", [0, 3])
+def test_a_damaged_text_of_velox_costs_only_what_it_said(damaged: int, tmp_path: Path) -> None:
+    path = velox(tmp_path / "a.emd", FRAMES)
+    with h5py.File(path, "a") as file:
+        file["Data/Image/a1/Metadata"][:9, damaged] = ord("{")
+    known = open_source(path).metadata
+    assert (known.pixel_size_pm, known.frame_time_s) == (20.0, 0.25)
+    temperatures = [np.nan if k == damaged else 20.0 + k for k in range(len(FRAMES))]
+    np.testing.assert_array_equal(known.along_frames["temperature"].values, temperatures)
+    assert any(f"metadata of 1 frames (first {damaged}) are damaged" in note for note in known.notes)

@@ -47,8 +47,8 @@ def _no_time(axis: Axis, unit: str, where: str) -> tuple[str, ...]:
     if unit.lower() in (*_NO_UNITS, "frame", "frames") and step in (0.0, 1.0):
         return ()
     named = f"along {axis.name}" if axis.name else "of its frames"
-    what = f"{step:.6g} {unit}" if unit else f"{step:.6g} without a unit"
-    return (f"{where}: the step {named} is {what}, which is not a time; the frame time is not known",)
+    what = f"{axis.scale:.6g} {unit}" if unit else f"{axis.scale:.6g} without a unit"
+    return (f"{where}: the step {named} is {what}, which is not a frame time; the frame time is not known",)
 
 
 DECLARED = ("pixel_size_", "frame_time_")
