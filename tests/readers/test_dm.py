@@ -124,6 +124,7 @@ def test_a_thumbnail_that_no_tag_names_is_not_the_movie(tmp_path: Path) -> None:
         ([(0.2, "Å"), (0.2, "Å"), (20.0, "µs")], 20, 2e-5, ""),
         ([(0.001, "µm"), (0.002, "µm"), (1.0, "")], 1000, None, "not square"),
         ([(-0.1, "nm"), (0.1, "nm"), (2.0, "nm")], 100, None, "its frames are 2 nm apart, which is not a frame time"),
+        ([(0.1, "nm"), (0.1, "nm"), (0.5, "")], 100, None, "its frames are 0.5 (no unit) apart"),
         ([(0.01, "1/nm"), (0.01, "1/nm"), (1.0, "sec")], None, 1, "calibrated in 1/nm, which is not a length"),
         ([(0.1, "nm"), (1.0, "")], 100, None, "only one of x and y is calibrated"),
         ([(0.0, "nm"), (0.0, "nm")], None, None, "a pixel of 0 nm is impossible"),
@@ -167,6 +168,17 @@ def test_the_frame_time_of_tags(tags: Any, seconds: float | None, words: str, tm
 def stamped(seconds: float) -> dict[str, Any]:
     tilt = {"Microscope Info": {"Stage Position": {"Stage Alpha": seconds / 10}}}
     return {"DataBar": {"Acquisition Time (OS)": 1.31e17 + 1e7 * seconds, "Exposure Time (s)": 0.1}} | tilt
+
+
+@pytest.mark.parametrize("silent", [0, 4])
+def test_a_file_without_a_time_stamp_among_others_is_named(silent: int, tmp_path: Path) -> None:
+    for k in range(5):
+        write_dm(tmp_path / f"f_{k}.dm4", FRAMES[k], LENGTHS, None if k == silent else stamped(0.5 * k))
+    known = open_source(tmp_path).metadata
+    assert list(known.along_frames) == ["stage_tilt"]
+    tilts = [np.nan if k == silent else 0.05 * k for k in range(5)]
+    np.testing.assert_allclose(known.along_frames["stage_tilt"].values, tilts)
+    assert any(f"f_{silent}.dm4 does not say when it was taken, other files do" in note for note in known.notes)
 
 
 def test_a_folder_of_single_frames_has_the_times_of_its_files(tmp_path: Path) -> None:

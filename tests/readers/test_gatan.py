@@ -177,3 +177,14 @@ def test_a_tree_that_holds_nothing_or_what_the_permit_refuses(tmp_path: Path) ->
 
     with pytest.raises(SourceError, match="may not be opened"):
         open_source(tmp_path / "b", permit=permit)
+
+
+@pytest.mark.parametrize(
+    "names", [("movie.DM4", "movie.RAW", "movie.RAW_1"), ("movie.DM4", "movie.raw", "movie.Raw_1")]
+)
+def test_names_in_capitals(names: tuple[str, ...], tmp_path: Path) -> None:
+    write_director(tmp_path / "movie.dm4", FRAMES, (FRAME * 3 + 5,))
+    for name, was in zip(names, ("movie.dm4", "movie.raw", "movie.raw_1"), strict=True):
+        (tmp_path / was).rename(tmp_path / name)
+    for place in (tmp_path / names[0], tmp_path / names[1], tmp_path):
+        np.testing.assert_array_equal(open_source(place).read(0, 12), FRAMES)

@@ -14,6 +14,9 @@ from files_hdf5 import FRAMES, emd, hyperspy, nexus, velox
 
 from tract_dask.errors import SourceError
 from tract_dask.readers import FrameSource, open_source
+from tract_dask.settings import MetadataSettings
+from tract_dask.stages.convert.stage import convert
+from tract_dask.store.movie import open_movie
 
 LAST = FRAMES.transpose(1, 2, 0)
 MIRROR = FRAMES.transpose(2, 1, 0)
@@ -141,6 +144,71 @@ def test_times_of_an_axis_with_lost_frames(tmp_path: Path) -> None:
     assert "gap of 1.5 s after frame 2" in found.notes[0]
 
 
+@pytest.mark.parametrize(
+    ("unit", "scale", "said"),
+    [
+        ("", 0.5, "along time is 0.5 without a unit"),
+        ("frames", 0.5, "along time is 0.5 frames"),
+        ("deg", 1.0, "along time is 1 deg"),
+        ("frames", 1.0, ""),
+        ("", 1.0, ""),
+        ("ms/frame", 40.0, ""),
+    ],
+)
+def test_a_step_between_frames_that_is_no_time_is_said(unit: str, scale: float, said: str, tmp_path: Path) -> None:
+    known = open_source(hyperspy(tmp_path / "a.hspy", FRAMES, [("time", unit, scale, True), Y, X])).metadata
+    assert known.frame_time_s == (0.04 if unit.startswith("ms") else None)
+    assert [said in note for note in known.notes] == [True] * bool(said)
+
+
+def test_axes_count_more_than_attributes_and_contradictions_are_said(tmp_path: Path) -> None:
+    path = hyperspy(tmp_path / "a.hspy", FRAMES, [T, Y, X])
+    with h5py.File(path, "a") as file:
+        attributes = file["Experiments/x/data"].attrs
+        attributes.update({"pixel_size_nm": 0.05, "frame_time_s": "0,04", "pixel_size_um": "wide"})
+    known = open_source(path).metadata
+    assert (known.pixel_size_pm, known.frame_time_s) == (20.0, 0.04)
+    assert known.notes == (
+        "a.hspy: its attribute pixel_size_um cannot be understood; it is not used",
+        "a.hspy: the pixel size is 20 pm by its axes, 50 pm by its attributes",
+    )
+
+
+def test_a_frame_time_near_that_of_the_stamps_leaves_them(tmp_path: Path) -> None:
+    times = np.array([0, 0.0401, 0.0802, 0.2005, 0.2406])
+    path = nexus(tmp_path / "a.nxs", np.zeros((5, 64, 64), "u2"), ["t", "y", "x"], t=(times, "s"))
+    with h5py.File(path, "a") as file:
+        file["entry/data/counts"].attrs["frame_time_ms"] = 40.0
+    movie = open_movie(convert(path, tmp_path / "movie.zarr"))
+    np.testing.assert_allclose(movie.times(), times, atol=1e-12)
+    assert movie.frame_time_s == 0.0401
+    known = open_source(path, metadata=MetadataSettings(frame_time_s=0.02)).metadata
+    assert known.frame_time_s == 0.02
+    assert "their time stamps, usually 0.0401 s apart, are not used" in known.notes[-1]
+
+
+@pytest.mark.parametrize("n_places", [2, 6])
+def test_an_axis_with_two_places_or_with_edges_gives_its_step(n_places: int, tmp_path: Path) -> None:
+    places = np.arange(n_places) * 0.5
+    dims = [("t", "s", places), ("y", "nm", step(FRAMES.shape[1])), ("x", "nm", step(FRAMES.shape[2])[:2])]
+    known = open_source(emd(tmp_path / "a.emd", FRAMES, dims)).metadata
+    assert (known.pixel_size_pm, known.frame_time_s, dict(known.along_frames)) == (20.0, 0.5, {})
+
+
+def test_velox_says_what_it_does_not_keep_of_very_many_frames(tmp_path: Path) -> None:
+    known = open_source(velox(tmp_path / "a.emd", np.zeros((1001, 4, 4), "u2"))).metadata
+    assert not known.along_frames
+    assert "temperature of the first 1000 frames were read only; they are not kept" in known.notes[-1]
+
+
+def test_times_of_a_fast_camera_keep_their_gap_in_the_store(tmp_path: Path) -> None:
+    times = np.array([0, 1, 2, 5, 6]) / 7500
+    frames = np.zeros((5, 64, 64), "u2")
+    place = nexus(tmp_path / "a.nxs", frames, ["t", "y", "x"], t=(times, "s"))
+    movie = open_movie(convert(place, tmp_path / "movie.zarr"))
+    np.testing.assert_allclose(movie.times(), times, rtol=0, atol=1e-11)
+
+
 REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "spectrum image": (
         lambda path: hyperspy(path, LAST, [(*Y[:3], True), (*X[:3], True), ("Energy loss", "eV", 1, False)]),
@@ -243,7 +311,7 @@ def test_damaged_texts_of_velox_are_a_note(tmp_path: Path) -> None:
         file["Data/Image/a1/Metadata"][:100] = 7
     source = open_source(path)
     same(source)
-    assert "calibration cannot be read" in source.metadata.notes[0]
+    assert "Velox's metadata are damaged" in source.metadata.notes[0]
 
 
 def test_values_that_are_to_be_scaled_are_noted(tmp_path: Path) -> None:
@@ -272,3 +340,15 @@ def test_a_heap_of_texts_without_an_end(tmp_path: Path) -> None:
     whole[at : at + 400] = bytes(400)
     path.write_bytes(whole)
     fails(path, "the texts in the file are damaged")
+
+
+@pytest.mark.parametrize("damaged", [0, 3])
+def test_a_damaged_text_of_velox_costs_only_what_it_said(damaged: int, tmp_path: Path) -> None:
+    path = velox(tmp_path / "a.emd", FRAMES)
+    with h5py.File(path, "a") as file:
+        file["Data/Image/a1/Metadata"][:9, damaged] = ord("{")
+    known = open_source(path).metadata
+    assert (known.pixel_size_pm, known.frame_time_s) == (20.0, 0.25)
+    temperatures = [np.nan if k == damaged else 20.0 + k for k in range(len(FRAMES))]
+    np.testing.assert_array_equal(known.along_frames["temperature"].values, temperatures)
+    assert any(f"metadata of 1 frames (first {damaged}) are damaged" in note for note in known.notes)

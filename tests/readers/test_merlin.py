@@ -136,3 +136,10 @@ def test_a_file_that_was_cut_short(tmp_path: Path) -> None:
     source: Any = open_source(path)
     assert source.shape[0] == 2
     assert "bytes after its last whole frame are not read" in source.metadata.notes[0]
+
+
+def test_an_empty_hdr_file_says_nothing(tmp_path: Path) -> None:
+    frames = np.arange(2 * 6 * 8, dtype="u2").reshape(2, 6, 8)
+    path = write_mib(tmp_path / "a.mib", frames)
+    (tmp_path / "a.hdr").write_bytes(b"")
+    np.testing.assert_array_equal(open_source(path).read(0, 2), frames)

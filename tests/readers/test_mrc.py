@@ -246,3 +246,27 @@ def test_serialems_set_of_frames(lines: str, dose: float, seconds: float, note: 
     assert (known.pixel_size_pm, known.dose, known.frame_time_s) == (80.0, dose, seconds)
     assert note in " ".join(known.notes)
     assert bool(known.notes) == bool(note)
+
+
+def test_a_frame_time_of_another_place_does_not_hide_time_stamps(tmp_path: Path) -> None:
+    seconds = np.array([0, 1, 2, 7, 8, 9]) * 2.01
+    stamps = [45000 + second / 86400 for second in seconds]
+    path = mrc(tmp_path / "acq_movie.mrc", COUNTS, 0, extended=fei_records(6, Timestamp=stamps), exttyp=b"FEI2")
+    known = open_source(path).metadata
+    assert known.frame_time_s == pytest.approx(2.01, abs=1e-6)
+    np.testing.assert_allclose(known.along_frames["time"].values, seconds, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["acq_movie.mrc.mdoc", "acq_movie.mdoc", "acq_info.txt"])
+def test_an_empty_file_beside_a_movie_says_nothing(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"")
+    source = open_source(mrc(tmp_path / "acq_movie.mrc", COUNTS.astype("u2"), 6))
+    assert source.metadata == SourceMetadata()
+
+
+@pytest.mark.parametrize("exposure", ["inf", "nan", "-1", "1e300"])
+def test_an_exposure_that_cannot_be_gives_no_frame_time(exposure: str, tmp_path: Path) -> None:
+    text = f"[FrameSet = 0]\nExposureTime = {exposure}\nNumSubFrames = 6\n"
+    (tmp_path / "a.mrc.mdoc").write_text(text)
+    source = open_source(mrc(tmp_path / "a.mrc", COUNTS.astype("u2"), 6))
+    assert source.metadata.frame_time_s is None

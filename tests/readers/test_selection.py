@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from files_stamped import write_seq
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
@@ -16,6 +17,8 @@ from tract_dask.errors import SettingsError
 from tract_dask.readers import open_source
 from tract_dask.readers.selection import span
 from tract_dask.settings import MetadataSettings, SourceSettings
+from tract_dask.stages.convert.stage import convert
+from tract_dask.store.movie import open_movie
 
 FRAMES = np.random.default_rng(3).integers(0, 250, (12, 21, 26)).astype("u1")
 
@@ -67,6 +70,27 @@ def test_sizes_and_times_are_those_of_the_part(tmp_path: Path) -> None:
     known = MetadataSettings(pixel_size_pm=8.0, frame_time_s=0.025, dose=100.0, gain=0.5)
     part = open_source(tmp_path / "movie.npy", SourceSettings(frames="0:12:4", bin=2), known).metadata
     assert (part.pixel_size_pm, part.frame_time_s, part.dose, part.gain) == (16.0, 0.1, 100.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("part", "times", "step"),
+    [
+        ("1::2", [0, 0.16, 0.24], 0.12),
+        ("1:4", [0, 0.04, 0.16], 0.08),
+        ("::3", [0, 0.2], 0.2),
+        ("3:", [0, 0.04, 0.08], 0.04),
+        ("5:", [0], 0.04),
+    ],
+)
+def test_a_part_keeps_the_times_of_frames_around_a_gap(
+    part: str, times: list[float], step: float, tmp_path: Path
+) -> None:
+    stamps = [1_700_000_000_000_000 + 40_000 * k for k in (0, 1, 2, 5, 6, 7)]
+    frames = np.arange(6 * 64 * 64, dtype="u2").reshape(6, 64, 64)
+    place = write_seq(tmp_path / "lost.seq", frames, stamps_us=stamps)
+    movie = open_movie(convert(place, tmp_path / "movie.zarr", source_settings=SourceSettings(frames=part)))
+    assert movie.times().tolist() == times
+    assert movie.frame_time_s == step
 
 
 @pytest.mark.parametrize("dtype", ["u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"])

@@ -150,6 +150,7 @@ def test_a_list_of_files_is_never_changed(tmp_path: Path) -> None:
         (["f_0.npy", "f_1.npy", "f_5.npy"], "f_5.npy follows f_1.npy"),
         (["f_0.npy", "f_1.npy", "f_5.npy", "sum.npy"], "f_5.npy follows f_1.npy"),
         (["f_0.npy", "f_1.npy", "sum.npy"], "sum.npy (1 file)"),
+        (["t_1e-2s.npy", "t_1e-3s.npy", "t_2e-3s.npy"], "numbers such as 1e-2, which are not taken for powers of ten"),
     ],
 )
 def test_what_a_person_would_not_take_for_one_movie(names: list[str], note: str, tmp_path: Path) -> None:

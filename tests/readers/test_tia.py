@@ -146,3 +146,10 @@ def test_damage(tmp_path: Path) -> None:
     path.write_bytes(bytes(len(whole)))
     with pytest.raises(SourceError, match="not that of a TIA series"):
         open_source(path)
+
+
+def test_an_empty_emi_file_says_nothing(tmp_path: Path) -> None:
+    frames = np.arange(2 * 6 * 8, dtype="u2").reshape(2, 6, 8)
+    write_ser(tmp_path / "a_1.ser", frames, stamps=[5, 5])
+    (tmp_path / "a.emi").write_bytes(b"")
+    assert open_source(tmp_path / "a_1.ser").metadata.frame_time_s is None

@@ -11,6 +11,7 @@ from files_stamped import tvips_frame, tvips_series, write_tvips
 
 from tract_dask.errors import SourceError
 from tract_dask.readers import open_source
+from tract_dask.stages.convert.stage import convert
 
 FRAMES = np.random.default_rng(0).integers(0, 60_000, (7, 12, 16)).astype("u2")
 
@@ -144,3 +145,14 @@ def test_a_damaged_size_that_makes_billions_of_frames(tmp_path: Path) -> None:
     os.truncate(path, 2**31)  # a sparse file
     with pytest.raises(SourceError, match=r"number of frames is impossible.*165,\d{3},\d{3} of a few bytes"):
         open_source(path)
+
+
+def test_a_converted_movie_opens_with_what_its_frames_said(tmp_path: Path) -> None:
+    frames = np.arange(5 * 64 * 64, dtype="u2").reshape(5, 64, 64)
+    place = write_tvips(tmp_path / "a.tvips", frames, values=(1, 2, 300.0, 310.0, 0, 5.0))
+    again = open_source(convert(place, tmp_path / "movie.zarr"))
+    known, along = open_source(place).metadata, again.metadata.along_frames
+    assert set(along) == set(known.along_frames)
+    for name, of in known.along_frames.items():
+        assert along[name].units == of.units
+        np.testing.assert_allclose(along[name].values, of.values, atol=1e-12)

@@ -8,15 +8,16 @@ from tract_dask.readers.units import number, odd_length, odd_time, quantity, to_
 
 LENGTHS = {
     1.0: "pm PM picometer Picometres pm\0",
-    100.0: "Å å A \u212b angstrom Angstroms Ångström \\u00C5 \\u00c5 \\u212B Ã… [Å]",
-    1e3: "nm NM nanometer nanometres nm. (nm)",
+    100.0: "Å å A \u212b angstrom Angstroms Ångström \\u00C5 \\u00c5 \\u212B Ã… [Å] Å/px A/pixel"
+    " A° Angstroem &Aring; &#197;",
+    1e3: "nm NM nanometer nanometres nm. (nm) nm/px nm/pixel [nm/pix] nano-meter",
     1e6: "um µm μm micron Microns micrometer micrometres \\u00B5m \\u03BCm Âµm",
     1e9: "mm millimeter millimetres",
 }
 TIMES = {
     1e-9: "ns nanosecond nsec",
     1e-6: "us µs μs usec microsecond microseconds \\u00B5s \\u00b5sec",
-    1e-3: "ms msec msecs millisecond milliseconds Millisec ms.",
+    1e-3: "ms msec msecs millisecond milliseconds Millisec ms. ms/frame milli-seconds",
     1.0: "s S sec Sec. secs second seconds",
     60.0: "min mins minute minutes",
     3600.0: "h hr hrs hour hours",
@@ -29,6 +30,13 @@ def test_lengths(size: float, unit: str) -> None:
     value = 1e-6 if size > 1e6 else 1.0
     assert to_pm(value, unit) == pytest.approx(size * value)
     assert odd_length(unit, "a") == ()
+
+
+def test_units_of_one_pixel_or_frame_in_words() -> None:
+    assert to_pm(0.02, "nm per pixel") == 20.0
+    assert to_seconds(2.0, "milli seconds per frame") == 0.002
+    assert to_pm(0.02, "1/nm") is None
+    assert to_seconds(25.0, "frames/s") is None
 
 
 def test_metres() -> None:

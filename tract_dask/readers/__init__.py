@@ -34,6 +34,7 @@ from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
 from .tia import is_emi, open_tia
 from .tiff import open_tiff
+from .times import agreed
 from .tvips import is_later_part, open_tvips
 from .zarr_arrays import open_zarr
 from .zarr_place import is_zarr
@@ -143,7 +144,7 @@ def open_source(
     name = next(iter(place), "an empty list") if isinstance(place, list) else str(place)
     with reading(name):
         source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
-    known = source.metadata
+    known = agreed(source.metadata, Path(name).name)
     merged = replace(
         known,
         gain=metadata.gain,

@@ -253,14 +253,14 @@ def doubts(shape: tuple[int, ...], where: str) -> tuple[str, ...]:
 
 
 def plain_unit(unit: str) -> str:
-    """Return a unit without the signs of EMD, in which ``[n_m]`` is nm.
+    """Return a unit without the signs of EMD, in which ``[n_m]`` is nm, and without the moment from which time runs.
 
     Examples
     --------
-    >>> plain_unit("[n_m]"), plain_unit("[]"), plain_unit("1/nm")
-    ('nm', '', '1/nm')
+    >>> plain_unit("[n_m]"), plain_unit("[]"), plain_unit("1/nm"), plain_unit("seconds since 2026-11-30 10:00:00")
+    ('nm', '', '1/nm', 'seconds')
     """
-    unit = unit.strip("\0 \t\r\n")
+    unit = unit.partition(" since ")[0].strip("\0 \t\r\n")
     return unit[1:-1].replace("_", "") if unit.startswith("[") and unit.endswith("]") else unit
 
 

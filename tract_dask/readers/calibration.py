@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from .axes import Axis, Order, plain_unit
 from .source import SourceMetadata
 from .times import timed
-from .units import square_pixel, to_pm, to_seconds
+from .units import number, square_pixel, to_pm, to_seconds
 
 
 def calibrated(axes: Sequence[Axis], order: Order, where: str) -> SourceMetadata:
@@ -37,7 +37,18 @@ def _times(axis: Axis, where: str) -> SourceMetadata:
     second = to_seconds(1.0, unit)
     if second and axis.values is not None and len(axis.values) > 1:
         return timed(axis.values * second, Path(where.partition("::")[0]).name)
-    return SourceMetadata(frame_time_s=to_seconds(axis.scale, unit))
+    seconds = to_seconds(axis.scale, unit)
+    return SourceMetadata(frame_time_s=seconds, notes=_no_time(axis, unit, where) if seconds is None else ())
+
+
+def _no_time(axis: Axis, unit: str, where: str) -> tuple[str, ...]:
+    """Return a note where the axis of the frames is calibrated, but not in a unit of time."""
+    step = axis.scale if math.isfinite(axis.scale) else 1.0
+    if unit.lower() in (*_NO_UNITS, "frame", "frames") and step in (0.0, 1.0):
+        return ()
+    named = f"along {axis.name}" if axis.name else "of its frames"
+    what = f"{axis.scale:.6g} {unit}" if unit else f"{axis.scale:.6g} without a unit"
+    return (f"{where}: the step {named} is {what}, which is not a frame time; the frame time is not known",)
 
 
 DECLARED = ("pixel_size_", "frame_time_")
@@ -62,8 +73,44 @@ def declared(attributes: Mapping[str, Any]) -> tuple[float | None, float | None]
     return pixel, seconds
 
 
+def with_declared(said: SourceMetadata, holders: Iterable[Mapping[str, Any]], where: str) -> SourceMetadata:
+    """Return what the axes say, filled up by attributes; a note where these contradict it or cannot be understood.
+
+    Parameters
+    ----------
+    said
+        By the axes, which count more.
+    holders
+        The attributes of what holds the movie, of which the last count most.
+    where
+        The array, for notes.
+    """
+    pixel = seconds = None
+    notes = []
+    for attributes in holders:
+        found = declared(attributes)
+        pixel, seconds = found[0] or pixel, found[1] or seconds
+        for name, value in attributes.items():
+            if name.startswith(DECLARED) and declared({name: value}) == (None, None):
+                notes.append(f"{where}: its attribute {name} cannot be understood; it is not used")
+    for what, unit, known, given in (
+        ("pixel size", "pm", said.pixel_size_pm, pixel),
+        ("frame time", "s", said.frame_time_s, seconds),
+    ):
+        if known and given and not math.isclose(known, given, rel_tol=0.001):
+            notes.append(f"{where}: the {what} is {known:.6g} {unit} by its axes, {given:.6g} {unit} by its attributes")
+    return replace(
+        said,
+        pixel_size_pm=said.pixel_size_pm or pixel,
+        frame_time_s=said.frame_time_s or seconds,
+        notes=(*said.notes, *notes),
+    )
+
+
 def as_number(value: Any) -> float:
-    """Return a number; NaN where it is none."""
+    """Return a number, also of a text that has a comma for its point; NaN where it is none."""
+    if isinstance(value, str | bytes):
+        return number(value.decode("latin-1") if isinstance(value, bytes) else value)
     try:
         return float(np.asarray(value).item())
     except (TypeError, ValueError):

@@ -21,8 +21,9 @@ def calibration(image: Image) -> SourceMetadata:
     if frames is not None:
         along = image.axes[frames]
         seconds = to_seconds(along.scale, along.unit)
-        if along.unit and seconds is None:
-            notes += (f"{image.name}: its frames are {along.scale:.6g} {along.unit} apart, which is not a frame time",)
+        if seconds is None and (along.unit or along.scale not in (0.0, 1.0)):
+            unit = along.unit or "(no unit)"
+            notes += (f"{image.name}: its frames are {along.scale:.6g} {unit} apart, which is not a frame time",)
     if seconds is None:
         seconds, more = _of_tags(image)
         notes += more

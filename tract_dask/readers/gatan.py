@@ -83,7 +83,8 @@ def director_of(path: Path) -> Path | None:
     """Return the file that may direct a ``.raw`` file: of its name, beside it; None where there is none."""
     if path.suffix.lower() != ".raw":
         return None
-    return next((file for end in _DIRECTORS if os.path.lexists(file := path.with_suffix(end))), None)
+    ends = (*_DIRECTORS, *(end.upper() for end in _DIRECTORS))
+    return next((file for end in ends if os.path.lexists(file := path.with_suffix(end))), None)
 
 
 def is_part(path: Path) -> bool:
@@ -98,8 +99,8 @@ def is_movie(folder: Path) -> bool:
             names = {item.name for item in found}
     except OSError:
         return False  # who opens it is told why
-    stems = {name[:-4] for name in names if name.endswith(".raw")}
-    directed = any(f"{stem}{end}" in names for stem in stems for end in _DIRECTORS)
+    stems = {name[:-4] for name in names if name.lower().endswith(".raw")}
+    directed = any(name[:-4] in stems for name in names if name.lower().endswith(_DIRECTORS))
     return directed or any(_level(name) and _may_be_folder(folder / name) for name in names)
 
 
@@ -110,7 +111,9 @@ def _may_be_folder(place: Path) -> bool:
 
 def _director_in(folder: Path) -> Path | None:
     """Return the director of the only movie in a folder; None where none has frames beside it."""
-    files = sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES and not file.name.startswith("."))
+    files = sorted(
+        file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
+    )
     directors = {file.stem: file for file in reversed(files) if _has_parts(file)}
     others = [file.name for file in files if file.stem not in directors]
     if not directors:
@@ -129,7 +132,7 @@ def _director_in(folder: Path) -> Path | None:
 
 def _has_parts(director: Path) -> bool:
     """Tell whether frames lie beside a file, without a look at the whole folder, which may be large."""
-    parts = (director.with_suffix(end) for end in (".raw", ".raw_1"))
+    parts = (director.with_suffix(end) for end in (".raw", ".raw_1", ".RAW", ".RAW_1"))
     return director.suffix.lower() in _DIRECTORS and any(map(os.path.lexists, parts))
 
 
@@ -141,7 +144,7 @@ def _parts(director: Path) -> tuple[Path, ...]:
     SourceError
         Where one of them is missing.
     """
-    pattern = re.compile(re.escape(director.stem) + r"\.raw(?:_(\d{1,9}))?")
+    pattern = re.compile(re.escape(director.stem) + r"\.(?i:raw)(?:_(\d{1,9}))?")
     with os.scandir(director.parent) as found:
         numbers = {int(match[1] or 0): item.name for item in found if (match := pattern.fullmatch(item.name))}
     for expected, got in enumerate(sorted(numbers)):

@@ -15,7 +15,7 @@ from ..settings.run import SourceSettings
 from .axes import Axis, Order, ordered
 from .bitshuffled import FILTER, BitshuffledSource, chunks_of, codec_of
 from .blocks import fill_from
-from .calibration import DECLARED, as_number, calibrated, declared, packing
+from .calibration import DECLARED, as_number, calibrated, packing, with_declared
 from .candidates import ambiguous, movies_of
 from .dectris import master_metadata, parts_of
 from .hdf5_axes import axes_of, single, text
@@ -285,9 +285,8 @@ def _calibration(file: Any, dataset: Any, axes: list[Axis], order: Order, where:
 def _metadata(file: Any, dataset: Any, axes: list[Axis], order: Order, where: str) -> SourceMetadata:
     """Return the calibration of the axes or of Velox, or of attributes such as pixel_size_nm and frame_time_ms."""
     said = velox_metadata(dataset, where) if is_velox(dataset) else calibrated(axes, order, where)
-    pixel, seconds = said.pixel_size_pm, said.frame_time_s
-    for item in (file, dataset.file, dataset.parent, dataset):
-        found = declared({name: single(item, name) for name in item.attrs if name.startswith(DECLARED)})
-        pixel, seconds = found[0] or pixel, found[1] or seconds
+    holders = dict.fromkeys((file["/"], dataset.file["/"], dataset.parent, dataset))
+    attributes = [{name: single(item, name) for name in item.attrs if name.startswith(DECLARED)} for item in holders]
+    said = with_declared(said, attributes, Path(where.partition("::")[0]).name)
     scaled = packing(as_number(single(dataset, "scale_factor")), as_number(single(dataset, "add_offset")), where)
-    return replace(said, pixel_size_pm=pixel, frame_time_s=seconds, notes=said.notes + scaled)
+    return replace(said, notes=said.notes + scaled)

@@ -6,6 +6,7 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -33,10 +34,15 @@ def axes_of(dataset: Any, where: str, file: Any) -> tuple[list[Axis], tuple[str,
     try:
         for known in (_velox, _hyperspy, _emd, _nexus, partial(_linked, file=file), _scales):
             if axes := known(dataset):
-                return axes, ()
+                return [_of_length(axis, length) for axis, length in zip(axes, dataset.shape, strict=True)], ()
     except DAMAGE as error:
         return [Axis()] * dataset.ndim, (f"{where}: its axes cannot be read ({words(error)})",)
     return [Axis()] * dataset.ndim, ()
+
+
+def _of_length(axis: Axis, length: int) -> Axis:
+    """Return an axis without its places where they are not one for each element: EMD may list two, NeXus the edges."""
+    return axis if axis.values is None or len(axis.values) == length else replace(axis, values=None)
 
 
 def single(item: Any, name: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .source import FrameValues, SourceMetadata
 from .times import timed
-from .units import number, square_pixel, to_pm
+from .units import number, square_pixel, to_pm, to_seconds
 
 Fields = dict[str, str]
 """Keys and values of one section."""
@@ -88,7 +88,7 @@ def _of_frame_set(fields: Fields, n_frames: int, where: str) -> SourceMetadata:
     if count > 0 and count != n_frames:
         notes += (f"{where} counts {count:g} frames, the movie has {n_frames}; its exposure time is not used",)
     elif exposure > 0:
-        seconds = float(f"{exposure / n_frames:.9g}")
+        seconds = to_seconds(float(f"{exposure / n_frames:.9g}"), "s")
     dose, more = _dose(fields.get("FrameDosesAndNumber", ""), n_frames, where)
     return SourceMetadata(frame_time_s=seconds, dose=dose, notes=notes + more, start_s=_started(fields))
 

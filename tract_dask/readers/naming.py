@@ -59,7 +59,14 @@ def notes_on(names: Sequence[str]) -> tuple[str, ...]:
     for name in plain:
         kinds.setdefault(_kind(name, rule), []).append(name)
     largest = max(kinds.values(), key=len)
-    return _decimals(names, rule) + _copied(copies) + _several(kinds) + _series(largest, rule) + gaps(largest)
+    return (
+        _decimals(names, rule)
+        + _powers(names)
+        + _copied(copies)
+        + _several(kinds)
+        + _series(largest, rule)
+        + gaps(largest)
+    )
 
 
 def references(names: Sequence[str]) -> dict[str, str]:
@@ -154,6 +161,20 @@ def _decimals(names: Sequence[str], rule: re.Pattern[str]) -> tuple[str, ...]:
     if sorted(names, key=lambda name: _parts(name, rule)) == sorted(names, key=lambda name: _parts(name, whole)):
         return ()
     return ("the numbers in the names are taken with their signs and decimals, and the frames are in their order",)
+
+
+_POWER = re.compile(r"(?<![^\W_])\d+(?:[.,]\d+)?[eE][-+]\d{1,2}(?!\d)")
+
+
+def _powers(names: Sequence[str]) -> tuple[str, ...]:
+    """Return a note where names hold numbers with a power of ten, by which they are not ordered."""
+    found = next((match[0] for name in names if (match := _POWER.search(_stem(name)))), None)
+    if found is None or len(names) < 2:
+        return ()
+    return (
+        f"the names hold numbers such as {found}, which are not taken for powers of ten: check the order of the frames,"
+        " or give the files as a list",
+    )
 
 
 def _copies(names: Sequence[str]) -> dict[str, str]:

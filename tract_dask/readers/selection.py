@@ -228,7 +228,7 @@ def _metadata(
     }
     if "time" in along:
         times = along["time"]
-        along["time"] = FrameValues(times.values - times.values[0], times.units)
+        along["time"] = FrameValues(np.round(times.values - times.values[0], 12), times.units)
     pixel, seconds = known.pixel_size_pm, known.frame_time_s
     seconds = seconds and seconds * frames.step
     if has_stamps(known) and len(frames) > 1:  # steps vary, and frames may be lost

@@ -134,8 +134,13 @@ def _joined(known: Sequence[SourceMetadata], lengths: Sequence[int], names: Sequ
         return known[0]
     first = known[0]
     times = _times(known, lengths, names[0])
-    along = {name: _values(name, known, lengths) for name in first.along_frames if name != "time"}
-    if _say_time(known, lengths) and not times.along_frames:
+    named = dict.fromkeys(name for part in known for name in part.along_frames if name != "time")
+    along = {name: _values(name, known, lengths) for name in named}
+    silent = [k for k, part in enumerate(known) if part.start_s is None]
+    if 0 < len(silent) < len(known):
+        note = f"{names[silent[0]]} does not say when it was taken, other files do; the times of frames are not known"
+        times = replace(times, notes=(*times.notes, note))
+    elif _say_time(known, lengths) and not times.along_frames:
         note = f"each file has the times of its frames, but not when it began: the times of {names[0]} on are not known"
         times = replace(times, notes=(*times.notes, note))
     return replace(
@@ -165,8 +170,8 @@ def _times(known: Sequence[SourceMetadata], lengths: Sequence[int], where: str) 
 
 
 def _values(name: str, known: Sequence[SourceMetadata], lengths: Sequence[int]) -> FrameValues:
-    """Return the values of all files' frames; NaN where a file does not have them in the units of the first."""
-    units = known[0].along_frames[name].units
+    """Return the values of all files' frames; NaN where a file lacks them in the first one's units."""
+    units = next(part.along_frames[name].units for part in known if name in part.along_frames)
     parts = [part.along_frames.get(name) for part in known]
     return FrameValues(
         np.concatenate(

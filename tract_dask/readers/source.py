@@ -345,13 +345,13 @@ def is_named(file: Path) -> bool:
 
 
 def lies_there(file: Path, permit: Permit | None) -> bool:
-    """Tell whether there is a file of a name beside a movie; a link is asked for before it is followed.
+    """Tell whether a file of a name lies beside a movie and is not empty; a link is asked for before it is followed.
 
     What ``permit`` refuses is refused whether something lies there or not: nobody learns from links what there is.
     """
     if permit is not None and file.is_symlink():
         permit(Path(os.path.realpath(file)))
-    return file.is_file()
+    return file.is_file() and file.stat().st_size > 0
 
 
 def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:

@@ -239,6 +239,7 @@ def _frame_time(path: Path, permit: Permit | None) -> float | None:
     emi = path.with_name(re.sub(r"_\d+$", "", path.stem) + ".emi")
     if not lies_there(emi, permit) or not checked_file(emi, permit).st_size:
         return None
+    checked_file(emi, permit)
     with emi.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         times = {bytes(found[1]) for found in re.finditer(rb"<FrameTime>([0-9.eE+-]{1,30})</FrameTime>", data)}
     try:

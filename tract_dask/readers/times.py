@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -44,11 +47,6 @@ def timed(stamps_s: ArrayLike, where: str) -> SourceMetadata:
     return _course(stamps, float(stamps[0]), where)
 
 
-def usual_step(times: NDArray[np.float64]) -> float:
-    """Return the median step of two or more times, to nine digits."""
-    return float(f"{np.median(np.diff(times)):.9g}")
-
-
 def has_stamps(known: SourceMetadata) -> bool:
     """Tell whether the time stamps are the times of the frames: not where the user gave another frame time."""
     stamps = known.along_frames.get("time")
@@ -68,13 +66,49 @@ def timed_ticks(ticks: NDArray[np.int64], per_second: int, where: str) -> Source
 def _course(stamps: NDArray[np.float64], start_s: float, where: str) -> SourceMetadata:
     if len(stamps) < 2:
         return SourceMetadata(start_s=start_s if np.isfinite(stamps).all() else None)
-    steps = np.diff(stamps)
-    if not np.isfinite(stamps).all() or not (steps > 0).all():
+    since = np.round(stamps - stamps[0], 12)
+    steps = np.diff(since)
+    if not np.isfinite(since).all() or not (steps > 0).all():
         return SourceMetadata(notes=_unfit(steps, where))
-    usual = float(f"{np.median(steps):.9g}")
-    along = {"time": FrameValues(np.round(stamps - stamps[0], 9), "s")}
+    usual = usual_step(since)
+    along = {"time": FrameValues(since, "s")}
     notes = _gaps(steps, usual, where)
     return SourceMetadata(frame_time_s=usual, notes=notes, start_s=start_s, along_frames=along)
+
+
+def usual_step(times_s: NDArray[np.float64]) -> float:
+    """Return the median step between the times of two frames or more, in s.
+
+    Examples
+    --------
+    >>> usual_step(np.array([0, 0.04, 0.08, 0.2]))
+    0.04
+    """
+    return float(f"{np.median(np.diff(times_s)):.9g}")
+
+
+def agreed(known: SourceMetadata, where: str) -> SourceMetadata:
+    """Return what is known of a movie with one frame time: the median step of its time stamps, where it has some.
+
+    Where it has another frame time from a place that counts more, that is kept, without the stamps, and with a note.
+
+    Examples
+    --------
+    >>> stamps = {"time": FrameValues(np.array([0, 0.0401, 0.0802]), "s")}
+    >>> agreed(SourceMetadata(frame_time_s=0.04, along_frames=stamps), "a.mrc").frame_time_s
+    0.0401
+    >>> agreed(SourceMetadata(frame_time_s=0.02, along_frames=stamps), "a.mrc").notes
+    ('a.mrc: its time stamps are 0.0401 s apart, its frame time is 0.02 s; the stamps are not used',)
+    """
+    times = known.along_frames.get("time")
+    usual = usual_step(times.values) if times is not None and len(times.values) > 1 else None
+    if usual is None or known.frame_time_s == usual:
+        return known
+    if known.frame_time_s is None or math.isclose(known.frame_time_s, usual, rel_tol=0.01):
+        return replace(known, frame_time_s=usual)
+    said = f"its time stamps are {usual:.6g} s apart, its frame time is {known.frame_time_s:.6g} s"
+    along = {name: of for name, of in known.along_frames.items() if name != "time"}
+    return replace(known, notes=(*known.notes, f"{where}: {said}; the stamps are not used"), along_frames=along)
 
 
 def _unfit(steps: NDArray[np.float64], where: str) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from html import unescape
 
 _PREFIXES = {"p": 1e-12, "n": 1e-9, "u": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "": 1.0}
 _NAMED = {"pico": 1e-12, "nano": 1e-9, "micro": 1e-6, "milli": 1e-3, "centi": 1e-2, "deci": 1e-1, "": 1.0}
@@ -12,7 +13,9 @@ _NAMED = {"pico": 1e-12, "nano": 1e-9, "micro": 1e-6, "milli": 1e-3, "centi": 1e
 _PM = {f"{prefix}m": 1e12 * factor for prefix, factor in _PREFIXES.items()}
 _PM |= {f"{prefix}{word}": 1e12 * factor for prefix, factor in _NAMED.items() for word in ("meter", "metre", "m")}
 _PM |= {"fm": 1e-3, "femtometer": 1e-3, "femtometre": 1e-3, "km": 1e15, "micron": 1e6, "mkm": 1e6, "mu": 1e6}
-_PM |= dict.fromkeys(("a", "å", "ang", "angs", "angstrom", "angström", "ångström", "ångstrom", "aa"), 100.0)
+_PM |= dict.fromkeys(
+    ("a", "å", "a°", "ang", "angs", "angstrom", "angstroem", "angström", "ångström", "ångstrom", "aa"), 100.0
+)
 
 _SECONDS = {f"{prefix}{word}": factor for prefix, factor in _PREFIXES.items() for word in ("s", "sec", "second")}
 _SECONDS |= {f"{prefix}{word}": factor for prefix, factor in _NAMED.items() for word in ("second", "sec", "s")}
@@ -37,8 +40,8 @@ def to_pm(value: float, unit: str) -> float | None:
     --------
     >>> to_pm(0.5, "nm"), to_pm(0.04, "Å"), to_pm(1 / 72, "inch"), to_pm(0.0, "nm")
     (500.0, 4.0, None, None)
-    >>> to_pm(2, r"\u00C5"), to_pm(1e-10, "Meters"), to_pm(0.1, "1/nm")
-    (200.0, 100.0, None)
+    >>> to_pm(2, r"\u00C5"), to_pm(1e-10, "Meters"), to_pm(0.1, "1/nm"), to_pm(0.1, "nm/px")
+    (200.0, 100.0, None, 100.0)
     """
     return _convert(value, unit, _PM, _PLAUSIBLE_PM)
 
@@ -118,14 +121,21 @@ def _convert(value: float, unit: str, table: dict[str, float], plausible: tuple[
 
 def _scale(unit: str, table: dict[str, float]) -> float | None:
     """Return what one of a unit is; units come in any case, in brackets, in the plural and with a full stop."""
-    name = _plain(unit)
+    name = _SPLIT.sub(r"\1", _OF_ONE.sub("", _plain(unit)))
     singular = name.removesuffix("s") if len(name) > 3 else name
     return table.get(name, table.get(singular))
 
 
+_OF_ONE = re.compile(r"\s*(?:/|\bper\b)\s*(?:px|pix|pixels?|frames?|images?)\.?$")
+"""``nm/px`` and ``s per frame``: of one pixel, of one frame."""
+
+_SPLIT = re.compile(r"^(pico|nano|micro|milli|centi|deci)[\s-]+")
+"""``nano-meter`` in two words."""
+
+
 def _plain(unit: str) -> str:
     """Return a unit in one spelling: Java's escapes and twice encoded letters are undone."""
-    text = re.sub(r"\\u([0-9A-Fa-f]{4})", lambda found: chr(int(found[1], 16)), unit[:64])
+    text = re.sub(r"\\u([0-9A-Fa-f]{4})", lambda found: chr(int(found[1], 16)), unescape(unit[:64]))
     for wrong in ("cp1252", "latin-1"):
         try:
             text = text.encode(wrong).decode("utf-8")

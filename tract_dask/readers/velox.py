@@ -29,29 +29,32 @@ def is_velox(dataset: Any) -> bool:
 def velox_metadata(dataset: Any, where: str) -> SourceMetadata:
     """Return pixel size, frame time, and what the frames say of the stage; nothing where there are no such texts.
 
-    Raises
-    ------
-    ValueError
-        Where they are no JSON.
+    A text that is no JSON says nothing; there is a note.
     """
     said = list(_texts(dataset))
-    if not said:
-        return SourceMetadata(notes=(f"{where}: Velox's metadata are missing",))
-    first = said[0]
+    first = next(filter(None, said), None)
+    if first is None:
+        state = "damaged" if said else "missing"
+        return SourceMetadata(notes=(f"{where}: Velox's metadata are {state}",))
     sides = (("width", "PixelUnitX"), ("height", "PixelUnitY"))
     units = [text(_at(first, "BinaryResult", unit)) for _, unit in sides]
     sizes = [as_number(_at(first, "BinaryResult", "PixelSize", side)) for side, _ in sides]
     pixel, notes = square_pixel(*(to_pm(size, unit) for size, unit in zip(sizes, units, strict=True)))
     if pixel is None and units[0] not in ("", "m"):
         notes = (f"{where}: its pixels are measured in {units[0]}, which is not a length; the pixel size is not known",)
+    if damaged := [k for k, one in enumerate(said) if not one]:
+        notes += (f"{where}: Velox's metadata of {len(damaged)} frames (first {damaged[0]}) are damaged",)
     every = len(said) == dataset.shape[2]
-    times = timed_ticks(_stamps(said), 1_000_000, where)
+    times = timed_ticks(_stamps(said, first), 1_000_000, where)
     seconds, how = (times.frame_time_s, times.notes) if times.frame_time_s else _frame_time(first, where)
     if times.frame_time_s and not every:
         how += (
             f"{where}: the time stamps of the first {len(said)} frames give the frame time; the others were not read",
         )
-    along = _along(said) | dict(times.along_frames) if every else {}
+    along = _along(said)
+    if along and not every:
+        how += (f"{where}: {', '.join(along)} of the first {len(said)} frames were read only; they are not kept",)
+    along = along | dict(times.along_frames) if every else {}
     return SourceMetadata(pixel, seconds, notes=(*notes, *how), along_frames=along, start_s=times.start_s)
 
 
@@ -70,7 +73,10 @@ def _texts(dataset: Any) -> Iterator[dict[str, Any]]:
     if chunk > _MOST_BYTES * _MOST_COLUMNS:
         return
     for k in range(min(columns.shape[1], _MOST_COLUMNS)):
-        found = json.loads(columns[:, k].tobytes().partition(b"\0")[0])
+        try:
+            found = json.loads(columns[:, k].tobytes().partition(b"\0")[0])
+        except (ValueError, RecursionError):
+            found = {}
         yield found if isinstance(found, dict) else {}
 
 
@@ -81,9 +87,9 @@ def _at(found: Any, *names: str) -> Any:
     return "" if isinstance(found, dict) else found
 
 
-def _stamps(said: list[dict[str, Any]]) -> NDArray[np.int64]:
+def _stamps(said: list[dict[str, Any]], first: dict[str, Any]) -> NDArray[np.int64]:
     """Return the moments of a camera's frames in µs since 1970; none where one does not say it."""
-    key = f"Detectors[{_at(said[0], 'BinaryResult', 'Detector')}].TimeStamp"
+    key = f"Detectors[{_at(first, 'BinaryResult', 'Detector')}].TimeStamp"
     stamps = np.array([as_number(_at(one, "CustomProperties", key, "value")) for one in said])
     return np.zeros(0, np.int64) if not np.isfinite(stamps).all() else stamps.astype(np.int64)
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .axes import Order, ordered
-from .calibration import DECLARED, as_number, calibrated, declared, packing
+from .calibration import DECLARED, as_number, calibrated, packing, with_declared
 from .candidates import ambiguous, movies_of
 from .source import (
     Frames,
+    FrameValues,
     Permit,
     Source,
     SourceMetadata,
@@ -214,10 +215,9 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
         Where a movie store is unfinished.
     """
     above = node_at(place, node.name.rpartition("/")[0]) if node.name else None
-    for one in (above, node):
-        found = {} if one is None else one.attributes
-        pixel, seconds = declared({name: value for name, value in found.items() if name.startswith(DECLARED)})
-        said = replace(said, pixel_size_pm=pixel or said.pixel_size_pm, frame_time_s=seconds or said.frame_time_s)
+    holders = [{} if one is None else one.attributes for one in (above, node)]
+    attributes = [{name: value for name, value in one.items() if name.startswith(DECLARED)} for one in holders]
+    said = with_declared(said, attributes, path.name)
     factor, offset = (as_number(node.attributes.get(name, math.nan)) for name in ("scale_factor", "add_offset"))
     said = replace(said, notes=said.notes + packing(factor, offset, path.name))
     store = (above.attributes if above else {}).get("tract_dask")
@@ -235,8 +235,25 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
         pixel_size_pm=_or_none(known["pixel_size_pm"]),
         frame_time_s=_or_none(known["frame_time_s"]),
         dose=_or_none(known["dose"]),
+        along_frames={**said.along_frames, **_along(place, above, store)},
         notes=said.notes + ((note,) if gain not in (1.0, math.nan) and gain == gain else ()),
     )
+
+
+def _along(place: Place, group: Node | None, store: dict[str, Any]) -> dict[str, FrameValues]:
+    """Return what a movie store of ours keeps of its frames' headers beside their times."""
+    assert group is not None
+    listed = store.get("frame_values")
+    names = [str(name) for name in listed] if isinstance(listed, list) else []
+    found = {}
+    for name in names:
+        path = f"{group.name}/frame_{name}".strip("/")
+        node = node_at(place, path) if name != "time" and re.fullmatch(r"\w+", name) else None
+        if node is not None and node.shape == tuple(store.get("shape", ()))[:1]:
+            unit = node.attributes.get("units")
+            values = np.asarray(open_node(place, node)[...], np.float64)
+            found[name] = FrameValues(values, unit if isinstance(unit, str) else "")
+    return found
 
 
 def _or_none(value: float) -> float | None:

@@ -33,6 +33,9 @@ _UNITS = {
 }
 """Units as OME-Zarr spells them."""
 
+_OME_KINDS = {"time": "time", "channel": "channel"}
+"""Names for axes of which OME-Zarr says the type, under whatever name."""
+
 _OLD_AXES = ("t", "c", "z", "y", "x")
 """The axes of OME-Zarr before it named them."""
 
@@ -234,7 +237,9 @@ def _ome_axis(axis: Any, step: float) -> Axis:
     if isinstance(axis, str):
         return Axis(axis, "", step)
     unit = str(_object(axis).get("unit") or "")
-    return Axis(str(_object(axis).get("name", "")), _UNITS.get(unit.lower(), unit), step)
+    found = Axis(str(_object(axis).get("name", "")), _UNITS.get(unit.lower(), unit), step)
+    meant = _OME_KINDS.get(str(_object(axis).get("type")), "")
+    return found if Axis(found.name).kind or not meant else replace(found, name=meant)
 
 
 def _better(axis: Axis, coordinate: Axis) -> Axis:
