@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import tract_dask
 from tract_dask.cluster.connect import connect
-from tract_dask.kernels.blur import gaussian_kernel
+from tract_dask.kernels.windows import gaussian_kernel
 from tract_dask.run.pipeline import RunOutcome
 from tract_dask.settings import ClusterSettings, ColumnSettings, FitSettings, RunSettings
 from tract_dask.stages.drift import measure

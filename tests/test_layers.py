@@ -72,10 +72,10 @@ ALLOWED: dict[str, list[str]] = {
 INSIDE: dict[str, dict[str, list[str]]] = {
     "kernels": {
         "vectors": [],
-        "blur": ["vectors"],
-        "gaussian": ["vectors", "blur"],
+        "windows": ["vectors"],
+        "gaussian": ["vectors", "windows"],
         "centroids": ["vectors"],
-        "presence": ["vectors", "blur", "gaussian"],
+        "presence": ["vectors", "windows", "gaussian"],
         "sums": [],
         "registration": ["sums"],
         "alignment": ["registration"],

@@ -20,9 +20,9 @@ from tract_dask.analysis.filters import (
 )
 from tract_dask.cli import main as cli
 from tract_dask.errors import SettingsError
-from tract_dask.kernels.blur import blur
 from tract_dask.kernels.total_variation import total_variation
 from tract_dask.kernels.wiener import wiener
+from tract_dask.kernels.windows import blur
 from tract_dask.plots.filters import plot_filters
 from tract_dask.settings import FitSettings, MetadataSettings
 from tract_dask.store.schema import Status

@@ -10,9 +10,9 @@ from scipy import stats
 from tract_dask import convert, fit_columns, open_movie
 from tract_dask.analysis.presence import appearances, false_alarms, p_values, present, states
 from tract_dask.errors import SettingsError
-from tract_dask.kernels.blur import blur, cut_windows
 from tract_dask.kernels.gaussian.model import gaussian_image
 from tract_dask.kernels.presence import best_states, matched_filters, strengths
+from tract_dask.kernels.windows import blur, cut_windows
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
 
 COLUMN = np.array([3.0, 10.0, 10.0, 4.0, 3.2, 0.4, 0.0])

@@ -17,8 +17,8 @@ from distributed import Client, LocalCluster, get_worker
 from tract_dask.cluster import batch, crew, deaths, dispatch, tries
 from tract_dask.cluster.connect import connect
 from tract_dask.cluster.deaths import Death, is_to_blame
+from tract_dask.cluster.retries import Place, Trouble, is_hopeless, places_to_avoid, trouble
 from tract_dask.cluster.tasks import run_shards
-from tract_dask.cluster.tries import Place, Trouble, is_hopeless, places_to_avoid, trouble
 from tract_dask.errors import ClusterError, SourceError, StoreError
 from tract_dask.progress import Warned
 from tract_dask.run import one_stage

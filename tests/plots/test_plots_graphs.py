@@ -16,8 +16,8 @@ from plotted import BLUR, N_FRAMES, PIXEL_PM, PLACES, SHAPE, every_axes, make_tr
 from tract_dask import plots
 from tract_dask.cli.main import main
 from tract_dask.errors import SettingsError, StoreError
-from tract_dask.kernels.blur import blur
 from tract_dask.kernels.gaussian.model import evaluate, gaussian_image
+from tract_dask.kernels.windows import blur
 from tract_dask.plots.base import course
 from tract_dask.plots.of_run import FIGURES, draw_figures
 

@@ -14,7 +14,7 @@ from files_dm import document, image, numbered, thumbnail, write_dm, write_dm5, 
 
 from tract_dask.errors import SourceError
 from tract_dask.readers import open_source
-from tract_dask.readers.dm_tags import read_tags
+from tract_dask.readers.dm.tags import read_tags
 
 FRAMES = np.random.default_rng(0).integers(0, 120, (5, 6, 7)).astype("u2")
 LENGTHS = [(0.05, "nm"), (0.05, "nm"), (0.25, "s")]

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from tract_dask.errors import SettingsError
+from tract_dask.errors import SettingsError, SourceError
 from tract_dask.readers import open_source
 from tract_dask.readers.selection import span
 from tract_dask.settings import MetadataSettings, SourceSettings
@@ -100,6 +100,17 @@ def test_sums_of_bins_are_exact(dtype: str, tmp_path: Path) -> None:
     source = open_source(tmp_path / "movie.npy", SourceSettings(bin=32))
     assert source.dtype.kind == np.dtype(dtype).kind
     assert int(source.read(0, 1)[0, 0, 0]) == int(most) * 1024
+
+
+@pytest.mark.parametrize(("value", "fits"), [(2**40, True), (2**52, False)])
+def test_sums_of_the_largest_whole_numbers_are_exact_or_refused(value: int, fits: bool, tmp_path: Path) -> None:
+    np.save(tmp_path / "movie.npy", np.full((1, 8, 8), value, "u8"))
+    source = open_source(tmp_path / "movie.npy", SourceSettings(bin=8))
+    if fits:
+        assert source.read(0, 1).item() == 64 * value
+    else:
+        with pytest.raises(SourceError, match="sums of the bins"):
+            source.read(0, 1)
 
 
 def test_files_of_a_part_are_those_that_hold_it(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..kernels.blur import Tiles
 from ..kernels.gaussian import parameters
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND
 from ..kernels.sums import add_tiles
+from ..kernels.windows import Tiles
 from ..settings.run import FitSettings
 from ..stages.fit.lazy import fit_columns
 from ..store import schema

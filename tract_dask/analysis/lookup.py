@@ -13,12 +13,12 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingsError
-from ..kernels.blur import cut_windows
 from ..kernels.gaussian.fit import fit_gaussians
 from ..kernels.gaussian.information import column_bounds
 from ..kernels.gaussian.intensity import Floats, intensities
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from ..kernels.windows import cut_windows
 from ..settings.run import ColumnSettings, FitSettings
 from ..stages.columns.find import find_columns
 from ..stages.columns.window_size import neighbour_distance, resolve_window

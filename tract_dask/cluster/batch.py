@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..store.journal import Payload
 from .deaths import Death
-from .tries import Place, Trouble, trouble
+from .retries import Place, Trouble, trouble
 
 BATCH_S = 0.5
 """For so long a task goes on taking shards of its batch; a longer shard is a batch of its own."""

@@ -27,7 +27,7 @@ from ..store.shards import Shard
 from .batch import Batch, Numbers, Packed, Report, Todo, Work, next_size
 from .crew import HANG, HANG_S, LEFT_OUT_S, MOST_LOST, MOST_SWOLLEN, RESTART_S, Crew
 from .deaths import Death, death, is_to_blame
-from .tries import Rows, Trouble, is_hopeless, places_to_avoid, wait_s
+from .retries import Rows, Trouble, is_hopeless, places_to_avoid, wait_s
 
 SLOW = 20
 """So many times as long as the longest batch so far is too long; while there is none, five times :data:`HANG`."""

@@ -16,7 +16,7 @@ from ..store.journal import Journal, Payload
 from ..store.shards import Shard
 from .batch import BATCH_S, Numbers, Work
 from .dispatch import Dispatch, Finished, Tell
-from .tries import Place, Trouble, host_of, is_hopeless, trouble, wait_s
+from .retries import Place, Trouble, host_of, is_hopeless, trouble, wait_s
 
 _ROUNDS = 3
 """So often shards are made that are not on disk afterwards."""
@@ -99,7 +99,7 @@ def stream_shards(
     Raises
     ------
     TractError
-        The first error of a task that does not pass (:mod:`tract_dask.cluster.tries`); finished shards stay in the
+        The first error of a task that does not pass (:mod:`tract_dask.cluster.retries`); finished shards stay in the
         journal.
     StoreError
         Where shards crash the workers that work on them, where a shard is not on disk though it was written, or where

@@ -22,11 +22,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .blur import gaussian_kernel
 from .gaussian.model import blurred, evaluate
 from .gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from .vectors.simd import load, load_at, store, vector
 from .vectors.tracing import LANES
+from .windows import gaussian_kernel
 
 Array = NDArray[Any]
 

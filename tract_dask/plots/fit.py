@@ -15,10 +15,10 @@ from matplotlib.patches import Circle
 from scipy.ndimage import map_coordinates
 
 from ..errors import SettingsError
-from ..kernels.blur import blur, gaussian_kernel
 from ..kernels.gaussian.intensity import Floats
 from ..kernels.gaussian.model import evaluate
 from ..kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, THETA, X, Y
+from ..kernels.windows import blur, gaussian_kernel
 from ..store.movie import Movie
 from .base import (
     FONT,

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ..analysis.motion import displacement, pixel_size_pm, spread, standard_errors
 from ..analysis.motion import positions as positions_pm
-from ..kernels.blur import blur, gaussian_kernel
 from ..kernels.gaussian.intensity import Floats
+from ..kernels.windows import blur, gaussian_kernel
 from ..store.columns import positions
 from ..store.movie import Movie
 from .base import (

@@ -18,10 +18,11 @@ from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
-from . import gatan, video
-from .dectris import is_part
-from .eer import open_eer
+from . import video
+from .checks import Permit, checked_file, reading
+from .dm import in_situ as gatan
 from .hdf5 import open_hdf5
+from .hdf5.dectris import is_part
 from .listing import FileList, is_pattern, list_files
 from .merlin import headers_of_mibs, open_merlin
 from .mrc import open_mrc
@@ -31,13 +32,14 @@ from .registry import Reader, by_suffix, one_by_one
 from .selection import overridden, select
 from .seq import belongs_to_seq, open_seq
 from .sequence import SequenceSource, open_sequence
-from .source import FrameSource, Permit, Source, SourceMetadata, checked_file, reading
+from .source import FrameSource, Source, SourceMetadata
 from .tia import is_emi, open_tia
 from .tiff import open_tiff
+from .tiff.eer import open_eer
 from .times import agreed
 from .tvips import is_later_part, open_tvips
-from .zarr_arrays import open_zarr
-from .zarr_place import is_zarr
+from .zarr import open_zarr
+from .zarr.place import is_zarr
 
 __all__ = [
     "READERS",

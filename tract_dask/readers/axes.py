@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SourceError
-from .source import checked_shape
+from .checks import checked_shape
 from .units import to_pm, to_seconds
 
 

@@ -13,17 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SourceError
-from .source import (
-    NOTHING_KNOWN,
-    Frames,
-    Source,
-    SourceMetadata,
-    checked_dtype,
-    checked_shape,
-    reading,
-    truncated,
-    widened,
-)
+from .checks import Frames, checked_dtype, checked_shape, reading, truncated, widened
+from .source import NOTHING_KNOWN, Source, SourceMetadata
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SourceError
-from .source import Frames, Source
+from .checks import Frames
+from .source import Source
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

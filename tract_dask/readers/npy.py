@@ -14,17 +14,8 @@ import numpy as np
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import open_block
-from .source import (
-    Frames,
-    Permit,
-    Source,
-    SourceMetadata,
-    checked_dtype,
-    checked_shape,
-    truncated,
-    unaccounted,
-    widened,
-)
+from .checks import Frames, Permit, checked_dtype, checked_shape, truncated, unaccounted, widened
+from .source import Source, SourceMetadata
 
 _HEADER_BYTES = 10_000
 """NumPy, too, parses no longer header."""

@@ -10,7 +10,8 @@ import numpy as np
 from ..errors import SettingsError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, open_block
-from .source import Permit, SourceMetadata
+from .checks import Permit
+from .source import SourceMetadata
 
 
 def open_raw(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> BlockSource:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from ..settings.run import SourceSettings
-from .source import Permit, Source
+from .checks import Permit
+from .source import Source
 
 Opener: TypeAlias = Callable[[Path, str, SourceSettings, Permit | None], Source]
 """Takes a file or folder, the path inside it, how to read it, and what to ask before other files; makes every check."""

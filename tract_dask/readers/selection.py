@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SettingsError
+from ..errors import SettingsError, SourceError
 from ..settings.run import MetadataSettings, SourceSettings
-from .source import Frames, FrameValues, Part, Source, SourceMetadata
+from .checks import EXACT, Frames
+from .source import FrameValues, Part, Source, SourceMetadata
 from .times import SHOWN, has_stamps, usual_step
 
 
@@ -62,7 +63,16 @@ class SelectedSource(Source):
             return cut
         side, (n_frames, n_y, n_x) = self.bin_px, cut.shape
         squares = cut.reshape(n_frames, n_y // side, side, n_x // side, side)
-        summed: Frames = squares.sum((2, 4), dtype=np.float64 if self.dtype.kind == "f" else self.dtype)
+        whole = self.dtype.kind in "iu" and self.dtype.itemsize < 8
+        summed: Frames = squares.sum((2, 4), dtype=self.dtype if whole else np.float64)
+        if self.dtype.kind in "iu" and not whole and np.abs(summed).max(initial=0) > EXACT:  # it would wrap
+            raise SourceError(
+                "the sums of the bins are whole numbers that float64 cannot tell apart",
+                self.path,
+                f"sums from -{EXACT:,} to {EXACT:,}",
+                f"{float(np.abs(summed).max()):.6g}",
+                "Use smaller bins, or save the movie as float64 or uint32",
+            )
         return summed
 
     def close(self) -> None:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .source import Permit, SourceMetadata, checked_shape, is_named, truncated
+from .checks import Permit, checked_shape, is_named, truncated
+from .source import SourceMetadata
 from .times import timed_ticks
 
 _HEADER_BYTES = 1024

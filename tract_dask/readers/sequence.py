@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingSourceError, SourceError
+from .checks import Frames
 from .naming import gaps, notes_on
-from .source import Frames, FrameValues, Source, SourceMetadata
+from .source import FrameValues, Source, SourceMetadata
 from .times import timed
 
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .source import FrameValues, Permit, SourceMetadata, checked_file, checked_shape, truncated, untested
+from .checks import Permit, checked_file, checked_shape, truncated, untested
+from .source import FrameValues, SourceMetadata
 from .times import timed_ticks
 from .units import to_pm
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, SourceError
 from ..settings.run import SourceSettings
-from .source import Frames, Permit, Source, SourceMetadata, checked_claim, checked_shape
+from .checks import Frames, Permit, checked_claim, checked_shape
+from .source import Source, SourceMetadata
 from .times import timed
 
 SUFFIXES = (".avi", ".mp4", ".mov")

@@ -14,9 +14,9 @@ from ..analysis import overview
 from ..analysis.jumps import noise_factor
 from ..analysis.overview import Floats
 from ..errors import SettingsError
-from ..kernels.blur import blur
 from ..kernels.gaussian.model import evaluate
 from ..kernels.gaussian.parameters import AMPLITUDE, X, Y
+from ..kernels.windows import blur
 from ..settings.run import RunSettings
 from ..settings.toml import load
 from ..store import datasets, metadata, results, schema

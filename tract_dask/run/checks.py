@@ -12,8 +12,9 @@ from ..cluster.connect import local_memory_limit
 from ..errors import DestinationError, InputError, SettingsError, SourceError
 from ..progress import STAGES
 from ..readers import open_source
+from ..readers.checks import Permit
 from ..readers.listing import FileList
-from ..readers.source import FrameSource, Permit
+from ..readers.source import FrameSource
 from ..settings.run import ColumnSettings, DriftSettings, FitSettings, RunSettings
 from ..stages.columns.sites import lattice_sites
 from ..stages.columns.window_size import resolve_window

@@ -10,7 +10,7 @@ from pathlib import Path
 import xarray as xr
 from distributed import Client
 
-from ..cluster.tries import persist
+from ..cluster.retries import persist
 from ..progress import Sink, silent
 from ..settings.run import RunSettings
 from ..stages.columns.stage import check_edited, columns_stage

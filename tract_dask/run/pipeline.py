@@ -14,10 +14,11 @@ from typing import Any
 import xarray as xr
 from distributed import Client
 
-from ..cluster.tries import persist
+from ..cluster.retries import persist
 from ..progress import REPORT, JsonLines, RunState, Sink, StageDone, StageStarted, Warned, silent, tee
+from ..readers.checks import Permit
 from ..readers.listing import FileList
-from ..readers.source import FrameSource, Permit
+from ..readers.source import FrameSource
 from ..settings.run import RunSettings
 from ..settings.toml import to_toml
 from ..stages.columns.stage import check_edited, clear_columns, columns_stage

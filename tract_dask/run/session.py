@@ -16,8 +16,8 @@ import xarray as xr
 from distributed import Client
 
 from ..cluster.connect import LazyClient, memory_budget
+from ..cluster.retries import Done, persist
 from ..cluster.tls import open_to_others
-from ..cluster.tries import Done, persist
 from ..errors import StoreError
 from ..progress import Event, RunDone, RunStarted, RunState, Sink, StageDone, Warned
 from ..settings.cluster import ClusterSettings

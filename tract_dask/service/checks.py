@@ -18,8 +18,8 @@ from ..cluster.connect import local_memory_limit, memory_limit
 from ..errors import ClusterError, TractError
 from ..progress import STAGES
 from ..readers import open_source
+from ..readers.checks import Permit
 from ..readers.listing import FileList
-from ..readers.source import Permit
 from ..readers.times import has_stamps
 from ..run.checks import check_inputs, check_output
 from ..run.plan import Plan, plan_run

@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import MissingStoreError, StoreError
-from ..kernels.blur import Tiles
+from ..kernels.windows import Tiles
 from . import datasets, metadata, schema
 from .damage import reading
 from .journal import entries, journal_beside

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..blur import gaussian_kernel
+from ..windows import gaussian_kernel
 from .covariance import Noise
 from .engine import Options, Problem, fit_windows
 

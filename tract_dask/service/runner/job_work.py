@@ -16,8 +16,8 @@ from distributed import default_client
 from distributed.comm import CommClosedError
 
 from ...cluster.dispatch import JOB
+from ...cluster.retries import persist
 from ...cluster.tls import using
-from ...cluster.tries import persist
 from ...errors import ClusterError, ExitCode, TractError
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, clock, silent
 from ...readers.listing import FileList

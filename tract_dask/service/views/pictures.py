@@ -26,8 +26,9 @@ from scipy.sparse import csr_array
 from ...errors import InputError
 from ...kernels.greys import TRANSPARENT, grey_levels
 from ...readers import open_cached
+from ...readers.checks import Permit
 from ...readers.listing import FileList
-from ...readers.source import Permit, SourceMetadata
+from ...readers.source import SourceMetadata
 from ...settings.run import MetadataSettings, SourceSettings
 from ...store import datasets
 from ...store.metadata import attributes

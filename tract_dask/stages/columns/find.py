@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...errors import InputError, SettingsError
-from ...kernels.blur import cut_windows
 from ...kernels.gaussian.fit import GaussianFits, fit_gaussians
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.magnitude import unit_of
 from ...kernels.peaks import centroids, climb
+from ...kernels.windows import cut_windows
 from ...settings.run import ColumnSettings
 from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 from scipy.spatial import cKDTree
 
-from ...kernels.blur import blur
 from ...kernels.peaks import box_means, local_maxima
+from ...kernels.windows import blur
 
 Reals = NDArray[np.floating[Any]]
 Places = NDArray[np.float64]

@@ -10,7 +10,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ...errors import DestinationError, MissingSourceError, SourceError
-from ...readers.source import FrameSource, Source, SourceMetadata, reading
+from ...readers.checks import reading
+from ...readers.source import FrameSource, Source, SourceMetadata
 from ...settings.run import ConvertSettings, MetadataSettings, SourceSettings
 from ...store import metadata
 from ...store.keys import counted, default_of

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ...errors import SourceError
 from ...kernels.binning import FrameMeter
 from ...readers import open_source
-from ...readers.source import FrameSource, Permit, check_permitted
+from ...readers.checks import Permit, check_permitted
+from ...readers.source import FrameSource
 from ...settings.run import SourceSettings
 from ...store import files, schema
 from ...store.journal import Payload

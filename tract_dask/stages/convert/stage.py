@@ -21,8 +21,9 @@ from ...cluster.tasks import stream_shards
 from ...errors import ChangedSourceError, DestinationError, SourceError, StoreError
 from ...progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from ...readers import files_named_now, open_source
+from ...readers.checks import check_permitted
 from ...readers.selection import overridden
-from ...readers.source import FrameSource, SourceMetadata, check_permitted
+from ...readers.source import FrameSource, SourceMetadata
 from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, SourceSettings
 from ...settings.toml import from_toml, to_toml
 from ...store import datasets, disk, schema

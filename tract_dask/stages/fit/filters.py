@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from ...kernels.blur import blur
 from ...kernels.total_variation import total_variation
 from ...kernels.wiener import wiener
+from ...kernels.windows import blur
 from ...settings.run import FitSettings
 from ...settings.toml import from_dict
 from ...store.movie import Movie

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.blur import Tiles, cut_windows, gaussian_kernel
 from ...kernels.centroids import BEST_RADIUS, SMALLEST_RADIUS_PX, window_centroids
 from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.intensity import INTENSITY_SCALE, Floats, intensities
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.presence import strengths
+from ...kernels.windows import Tiles, cut_windows, gaussian_kernel
 from ...settings.run import FitSettings
 from ...store.movie import Movie
 from ...store.schema import SIZES, Status

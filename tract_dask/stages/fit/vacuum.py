@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...errors import SettingsError
-from ...kernels.blur import blur
 from ...kernels.gaussian.parameters import AMPLITUDE
 from ...kernels.magnitude import unit_of
+from ...kernels.windows import blur
 
 _SHARES = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8)
 _FLAT = 0.1

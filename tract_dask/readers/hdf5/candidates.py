@@ -1,0 +1,55 @@
+"""Which of the arrays in a file or store is the movie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import SourceError
+
+
+@dataclass(frozen=True)
+class Found:
+    """A data set: its path as seen from the file that the user named, its axes, and the type of its pixels.
+
+    ``signal`` tells whether its group says that it is what the group is about; ``label`` follows it in lists.
+    """
+
+    shown: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    signal: bool = False
+    label: str = ""
+
+
+def movies_of(found: list[Found]) -> list[Found]:
+    """Return what could be the movie: first what is the subject of its group, then other arrays of numbers."""
+    numbers = [item for item in found if item.dtype.kind in "iufcb"]
+    signals = [item for item in found if item.signal]
+    deep = [[item for item in items if len(item.shape) == 3] for items in (signals, numbers)]
+    flat = [[item for item in items if len(item.shape) == 2] for items in (signals, numbers)]
+    several = [[item for item in items if min(item.shape) > 1 and item.dtype.kind in "iufb"] for items in deep]
+    if len(several[0] or several[1]) == 1 and not (flat[0] and not deep[0]):
+        return several[0] or several[1]
+    more = [item for item in signals if len(item.shape) > 3]
+    return deep[0] or (flat[0] + deep[1]) or more or flat[1]
+
+
+def ambiguous(
+    path: Path, inner: str, movies: list[Found], found: list[Found], lost: list[str], *, there: bool
+) -> SourceError:
+    """Return the error where no array, or several, could be the movie; ``there``: whether ``inner`` leads somewhere."""
+    listing = ", ".join(f"{item.shown} {item.shape} {item.dtype}{item.label}" for item in (movies or found)[:20])
+    holds = f"a file that holds {listing}" if listing else "a file without data sets"
+    return SourceError(
+        f"there are {len(movies) or 'no'} data sets that could be the movie"
+        if there
+        else "there is nothing under this path",
+        f"{path}::{inner}" if inner else str(path),
+        "the path of one data set with axes (frames, y, x)",
+        f"{holds}, where {'; '.join(lost[:9])}" if lost else holds,
+        f"Name it, for example {path.name}::{movies[0].shown}" if movies else "Name one of those, or check the file",
+    )

@@ -1,0 +1,113 @@
+"""Whether the pixels of an HDF5 data set are in its file: libhdf5 reads what was never written as the fill value."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from ...errors import SourceError
+from ..checks import checked_claim, truncated
+
+_CHUNK_BYTES, _CHUNK_RATIO = 32 << 20, 100
+"""A chunk may claim so many bytes, and so many times the bytes of its file."""
+
+
+def check_storage(dataset: Any, where: str, files: tuple[Path, ...], raw_bytes: int) -> tuple[str, ...]:
+    """Check that the pixels are in the files; return a note where some were never written.
+
+    Parameters
+    ----------
+    files
+        All files that the pixels come from.
+    raw_bytes
+        Bytes of raw pixels that lie in files of their own.
+
+    Raises
+    ------
+    SourceError
+        Where they are not, or a frame or a chunk claims more than the files can hold.
+    """
+    size = sum(file.stat().st_size for file in files)
+    itemsize = dataset.dtype.itemsize
+    checked_claim(math.prod(sorted(dataset.shape)[-2:]) * itemsize, size, where)
+    properties = dataset.id.get_create_plist()
+    layout, n_bytes = properties.get_layout(), math.prod(dataset.shape) * itemsize
+    if properties.get_external_count():
+        if raw_bytes < n_bytes:
+            raise truncated(where, "before the last frame of its raw pixels", n_bytes, raw_bytes)
+    elif layout == h5py.h5d.CONTIGUOUS and (offset := dataset.id.get_offset()) is not None and offset + n_bytes > size:
+        raise truncated(where, "before the last frame", offset + n_bytes, size)
+    if layout == h5py.h5d.CHUNKED:
+        _check_chunks(dataset, size, where)
+    return unwritten(dataset, where)
+
+
+def unwritten(dataset: Any, where: str) -> tuple[str, ...]:
+    """Return a note where a part of a data set was never written, or, of a virtual one, comes from nowhere.
+
+    Raises
+    ------
+    SourceError
+        Where nothing was ever written.
+    """
+    properties = dataset.id.get_create_plist()
+    layout = properties.get_layout()
+    if layout == h5py.h5d.VIRTUAL:
+        return _uncovered(dataset, properties, where)
+    if layout == h5py.h5d.CONTIGUOUS and not properties.get_external_count() and dataset.id.get_offset() is None:
+        raise _never_written(where)
+    if layout != h5py.h5d.CHUNKED:
+        return ()
+    expected = math.prod(-(-n // chunk) for n, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    written = dataset.id.get_num_chunks()
+    if not written:
+        raise _never_written(where)
+    return () if written >= expected else (_PARTLY.format(where, expected - written, expected),)
+
+
+_PARTLY = "{}: {:,} of {:,} chunks were never written; their pixels are read as the fill value"
+
+
+def _uncovered(dataset: Any, properties: Any, where: str) -> tuple[str, ...]:
+    """Return a note where the sources of a virtual data set give fewer pixels than it has."""
+    covered = 0
+    for number in range(properties.get_virtual_count()):
+        space = properties.get_virtual_vspace(number)
+        if space.get_select_type() != h5py.h5s.SEL_HYPERSLABS:
+            return ()
+        if space.is_regular_hyperslab() and h5py.h5s.UNLIMITED in sum(space.get_regular_hyperslab()[2:], ()):
+            return ()  # as many as the sources have
+        covered += space.get_select_npoints()
+    if covered >= (n_pixels := math.prod(dataset.shape)):
+        return ()
+    if not covered:
+        raise _never_written(where)
+    return (
+        f"{where}: {n_pixels - covered:,} of {n_pixels:,} pixels of the virtual data set come from no file; they are"
+        " read as the fill value",
+    )
+
+
+def _check_chunks(dataset: Any, size: int, where: str) -> None:
+    n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    if n_bytes > _CHUNK_BYTES + _CHUNK_RATIO * size:
+        raise SourceError(
+            "one chunk would be far larger than the file can hold",
+            where,
+            f"at most {_CHUNK_BYTES + _CHUNK_RATIO * size:,} bytes from files of {size:,}",
+            f"{n_bytes:,} bytes, chunks {dataset.chunks}",
+            "The file is damaged, or repack it with h5repack -l CHUNK=1x512x512",
+        )
+
+
+def _never_written(where: str) -> SourceError:
+    return SourceError(
+        "no pixel of the data set was ever written",
+        where,
+        "stored frames",
+        "room for them only",
+        "Wait until the movie is written, or name another data set",
+    )
