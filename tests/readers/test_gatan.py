@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from files_dm import in_situ, write_director, write_dm, write_seconds
+from files_stamped import write_tvips
 
 from tract_dask.errors import SettingsError, SourceError
 from tract_dask.readers import files_named_now, is_movie_folder, open_source
@@ -188,3 +189,16 @@ def test_names_in_capitals(names: tuple[str, ...], tmp_path: Path) -> None:
         (tmp_path / was).rename(tmp_path / name)
     for place in (tmp_path / names[0], tmp_path / names[1], tmp_path):
         np.testing.assert_array_equal(open_source(place).read(0, 12), FRAMES)
+
+
+@pytest.mark.parametrize("writer", ["director", "tvips"])
+def test_an_empty_file_at_the_end_holds_no_frames(writer: str, tmp_path: Path) -> None:
+    if writer == "director":
+        path = write_director(tmp_path / "movie.dm4", FRAMES, ENDS)
+        (tmp_path / f"movie.raw_{len(ENDS) + 1}").touch()
+    else:
+        path = write_tvips(tmp_path / "movie.tvips", FRAMES, per_file=5)
+        (tmp_path / "movie_003.tvips").touch()
+    source = open_source(path)
+    np.testing.assert_array_equal(source.read(0, len(FRAMES)), FRAMES)
+    assert all(file.stat().st_size for file in source.files)

@@ -137,6 +137,12 @@ def lies_there(file: Path, permit: Permit | None) -> bool:
     return file.is_file() and file.stat().st_size > 0
 
 
+def without_empty_end(parts: Sequence[Path], permit: Permit | None) -> Sequence[Path]:
+    """Return the files of a movie without empty ones at the end: a camera may have opened a file for no more frames."""
+    last = max(k for k, part in enumerate(parts) if not k or lies_there(part, permit)) if parts else -1
+    return parts[: last + 1]
+
+
 def checked_file(path: Path, permit: Permit | None = None) -> os.stat_result:
     """Return the status of a file that may be opened, without opening it: to open a pipe would take forever.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .checks import Permit, checked_file, checked_shape, truncated, untested
+from .checks import Permit, checked_file, checked_shape, truncated, untested, without_empty_end
 from .source import FrameValues, SourceMetadata
 from .times import timed_ticks
 from .units import to_pm
@@ -50,7 +50,7 @@ def open_tvips(path: Path, inner: str, settings: SourceSettings, permit: Permit 
         Where a file is a later part, is damaged or too short, or a part is missing.
     """
     series = _series(path)
-    files = (path, *_later_parts(path))
+    files = (path, *_later_parts(path, permit))
     sizes = [checked_file(file, None if file == path else permit).st_size for file in files]
     starts = tuple(np.cumsum([0, *sizes[:-1]]).tolist())
     counts, notes = _counts(files, sizes, series)
@@ -152,7 +152,7 @@ def _not_a_series(path: Path, header: dict[str, int]) -> SourceError:
     )
 
 
-def _later_parts(path: Path) -> tuple[Path, ...]:
+def _later_parts(path: Path, permit: Permit | None) -> tuple[Path, ...]:
     """Return the files that go on after ``_000``.
 
     Raises
@@ -175,7 +175,7 @@ def _later_parts(path: Path) -> tuple[Path, ...]:
             "no such file",
             "Copy it, too; to read only the frames before it, move the later parts into another folder",
         )
-    return tuple(there[number] for number in sorted(there))
+    return tuple(without_empty_end([path, *(there[number] for number in sorted(there))], permit))[1:]
 
 
 def _counts(files: tuple[Path, ...], sizes: list[int], series: _Series) -> tuple[list[int], tuple[str, ...]]:

@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import MissingSourceError, SourceError
 from ...settings.run import SourceSettings
 from ..blocks import open_block
-from ..checks import Permit, checked_file, reading, untested
+from ..checks import Permit, checked_file, reading, untested, without_empty_end
 from ..naming import in_order
 from ..raw import open_raw
 from ..sequence import open_sequence
@@ -54,7 +54,7 @@ def open_gatan(path: Path, inner: str, settings: SourceSettings, permit: Permit 
     has_parts = _has_parts(path)
     if inner or not (has_parts or _n_recorded(image)):
         return open_image(document, image, notes, settings, permit)
-    parts = _parts(path) if has_parts else ()
+    parts = _parts(path, permit) if has_parts else ()
     n_frames, more = _count(document, image, parts, permit)
     if not n_frames:
         return open_image(document, image, notes + more, settings, permit)
@@ -137,7 +137,7 @@ def _has_parts(director: Path) -> bool:
     return director.suffix.lower() in _DIRECTORS and any(map(os.path.lexists, parts))
 
 
-def _parts(director: Path) -> tuple[Path, ...]:
+def _parts(director: Path, permit: Permit | None) -> tuple[Path, ...]:
     """Return the files that hold a movie's frames, in order.
 
     Raises
@@ -158,7 +158,8 @@ def _parts(director: Path) -> tuple[Path, ...]:
                 f"{numbers[got]} without it",
                 "Copy all files of the movie into one folder",
             )
-    return tuple(director.parent / numbers[k] for k in sorted(numbers))
+    parts = [director.parent / numbers[k] for k in sorted(numbers)]
+    return tuple(without_empty_end(parts, permit))
 
 
 def _n_recorded(image: Image) -> float | None:

@@ -60,6 +60,10 @@ function show(chosen) {
 
 async function choose(path, note = true) {
   if (note) go({ source: path });
+  if (note && path !== source) for (const name of ["frames", "roi", "bin"]) { // a part of another movie
+    const setting = form.get(`source.${name}`);
+    setting?.set(setting.row.default);
+  }
   source = path;
   about = null;
   show(true);
