@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster, get_worker
 
-from tract_dask.cluster import batch, crew, deaths, dispatch, tries
+from tract_dask.cluster import batch, crew, deaths, dispatch, retries
 from tract_dask.cluster.connect import connect
 from tract_dask.cluster.deaths import Death, is_to_blame
 from tract_dask.cluster.retries import Place, Trouble, is_hopeless, places_to_avoid, trouble
@@ -28,7 +28,7 @@ from tract_dask.store.shards import Shard, split
 
 PASSING = ["ESTALE", "EIO", "EMFILE", "ENFILE", "ENOTCONN", "ETIMEDOUT", "EAGAIN", "EREMOTEIO", "EHOSTDOWN"]
 A, B, C, D = "tls://10.0.0.1:1", "tls://10.0.0.1:2", "tls://10.0.0.2:1", "tls://10.0.0.3:1"
-QUICK = {tries.RETRY: 0.02, crew.HANG: 2.0}
+QUICK = {retries.RETRY: 0.02, crew.HANG: 2.0}
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_an_error_that_does_not_pass_is_raised_after_some_tries_with_worker_and_
         run(partial(fails_always, errno.EIO), client=None if here else client)
     assert caught.value.where == "movie.tif"
     assert ("on worker tls://127.0.0.1:" in caught.value.got) != here
-    assert (tmp_path / "tries").stat().st_size == tries.MOST_TRIES
+    assert (tmp_path / "tries").stat().st_size == retries.MOST_TRIES
 
 
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES])
@@ -171,7 +171,7 @@ def test_what_an_error_is_told_from():
 
 
 def meet(worker: str, number: int = errno.EIO) -> Trouble:
-    return Trouble(number, "movie.tif", Place(worker, tries.host_of(worker)), StoreError("x"))
+    return Trouble(number, "movie.tif", Place(worker, retries.host_of(worker)), StoreError("x"))
 
 
 def test_work_ends_where_every_worker_or_three_hosts_have_failed_often_enough():

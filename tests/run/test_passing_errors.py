@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import Scene
 
-from tract_dask.cluster import tries
+from tract_dask.cluster import retries
 from tract_dask.cluster.connect import connect
 from tract_dask.errors import ClusterError, StoreError, TractError
 from tract_dask.progress import ShardDone, StageStarted, Warned
@@ -56,7 +56,7 @@ HARM = Faults()  # an audit hook stays for ever
 
 @pytest.fixture
 def faults():
-    with dask.config.set({tries.RETRY: 0.01}):
+    with dask.config.set({retries.RETRY: 0.01}):
         yield HARM
     HARM.left = {}
 
@@ -154,8 +154,8 @@ def test_a_sync_that_fails_is_said_with_its_file(faults, run, whole, tmp_path, m
 
 
 def test_it_is_tried_several_times(faults, run, whole, tmp_path):
-    faults.begin(("open", ".sum.zarr.partial/.zarr.json."), number=errno.ETIMEDOUT, times=tries.MOST_TRIES - 1)
-    assert len(run(tmp_path / "run")) == tries.MOST_TRIES - 1
+    faults.begin(("open", ".sum.zarr.partial/.zarr.json."), number=errno.ETIMEDOUT, times=retries.MOST_TRIES - 1)
+    assert len(run(tmp_path / "run")) == retries.MOST_TRIES - 1
     check(whole, tmp_path / "run")
 
 
@@ -164,7 +164,7 @@ def test_what_does_not_pass_ends_the_run_with_the_file_and_is_gone_on_with(fault
     faults.begin(("open", "drift.zarr/zarr.json"), times=10**6)
     with pytest.raises(StoreError, match="Input/output error") as caught:
         run(tmp_path / "run", told.append)
-    assert sum(isinstance(event, Warned) for event in told) == tries.MOST_TRIES - 1
+    assert sum(isinstance(event, Warned) for event in told) == retries.MOST_TRIES - 1
     assert caught.value.where.endswith("run/drift.zarr/zarr.json")
     faults.left = {}
     assert not run(tmp_path / "run")
@@ -218,9 +218,9 @@ def test_waits_grow_and_can_be_interrupted(monkeypatch):
         if len(waited) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(tries, "sleep", wait)
+    monkeypatch.setattr(retries, "sleep", wait)
     with pytest.raises(KeyboardInterrupt):
-        tries.persist(fail, lambda event: None, "movie.tif")
+        retries.persist(fail, lambda event: None, "movie.tif")
     assert waited == [1.0, 2.0, 4.0]
 
 
@@ -236,5 +236,5 @@ def test_what_a_cluster_raises_is_not_tried_again():
         raise ClusterError("the cluster has gone") from ConnectionResetError(errno.ECONNRESET, "reset")
 
     with pytest.raises(ClusterError):
-        tries.persist(lose, lambda event: None, "movie.tif")
+        retries.persist(lose, lambda event: None, "movie.tif")
     assert len(asked) == 1

@@ -15,7 +15,7 @@ from conftest import Scene
 from distributed import Client
 
 from tract_dask.cluster import connect as cluster
-from tract_dask.cluster import tries
+from tract_dask.cluster import retries
 from tract_dask.errors import ClusterError, DestinationError, InputError, SettingsError, StoreError
 from tract_dask.progress import REPORT, STAGES, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.run import one_stage, pipeline, session
@@ -498,7 +498,7 @@ def test_an_error_of_the_system_in_the_driver_is_one_of_ours(job, monkeypatch, n
 
     with monkeypatch.context() as patched:
         patched.setattr(pipeline, "sum_stage", fails)
-        patched.setattr(tries, "wait_s", lambda count: 0.0)
+        patched.setattr(retries, "wait_s", lambda count: 0.0)
         with pytest.raises(StoreError) as caught:
             job()
     assert str(job.output) in str(caught.value)

@@ -117,6 +117,13 @@ def test_a_folder_of_frames_is_opened_as_one_movie_by_a_click(chromium, tmp_path
         page.locator("#as-one").click()
         expect(page.locator("#source-facts")).to_contain_text("5 frames · 144 × 160 px")
         expect(page.locator("#source-facts")).to_contain_text("5 files")
+        page.locator("#group-source summary").click()
+        field(page, "Frames").fill("0:3")
+        page.locator("#other").click()
+        page.get_by_role("button", name="Data root").click()
+        page.get_by_role("button", name="alone.npy").click()
+        expect(page.locator("#source-name")).to_have_text("alone.npy")
+        expect(field(page, "Frames")).to_have_value("")
 
 
 def test_a_movie_is_chosen_looked_at_and_measured_from_the_page(chromium, tmp_path):

@@ -60,10 +60,7 @@ function show(chosen) {
 
 async function choose(path, note = true) {
   if (note) go({ source: path });
-  if (note && path !== source) for (const name of ["frames", "roi", "bin"]) { // a part of another movie
-    const setting = form.get(`source.${name}`);
-    setting?.set(setting.row.default);
-  }
+  if (note && path !== source) for (const name of ["frames", "roi", "bin"]) form.get(`source.${name}`)?.reset(); // a part of another movie
   source = path;
   about = null;
   show(true);
