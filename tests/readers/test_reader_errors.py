@@ -445,6 +445,15 @@ def test_tiff_directories_that_overlap(tmp_path: Path) -> None:
     fails(path)
 
 
+@pytest.mark.parametrize("size", [1, 4])
+def test_hdf5_chunks_that_are_shorter_than_their_checksum(size: int, tmp_path: Path) -> None:
+    """libhdf5 reads before the beginning of such a chunk, and ends the process."""
+    with h5py.File(tmp_path / "movie.h5", "w") as file:
+        dataset = file.create_dataset("data", data=movie(), chunks=(1, N_Y, N_X), fletcher32=True)
+        dataset.id.write_direct_chunk((2, 0, 0), b"x" * size)
+    fails(tmp_path / "movie.h5", "too short for its checksum", "(2, 0, 0)")
+
+
 def test_hdf5_that_claims_too_much(tmp_path: Path) -> None:
     path = tmp_path / "movie.h5"
     with h5py.File(path, "w") as file:

@@ -42,6 +42,7 @@ def check_storage(dataset: Any, where: str, files: tuple[Path, ...], raw_bytes: 
         raise truncated(where, "before the last frame", offset + n_bytes, size)
     if layout == h5py.h5d.CHUNKED:
         _check_chunks(dataset, size, where)
+        _check_sums(dataset, where)
     return unwritten(dataset, where)
 
 
@@ -100,6 +101,33 @@ def _check_chunks(dataset: Any, size: int, where: str) -> None:
             f"at most {_CHUNK_BYTES + _CHUNK_RATIO * size:,} bytes from files of {size:,}",
             f"{n_bytes:,} bytes, chunks {dataset.chunks}",
             "The file is damaged, or repack it with h5repack -l CHUNK=1x512x512",
+        )
+
+
+_CHECKSUM_BYTES = 4
+
+
+def _check_sums(dataset: Any, where: str) -> None:
+    """Refuse chunks that are shorter than their checksum: libhdf5 reads before their beginning, and crashes.
+
+    Raises
+    ------
+    SourceError
+        Naming the first of them.
+    """
+    if not dataset.fletcher32:
+        return
+
+    def short(chunk: Any) -> Any:
+        return chunk if chunk.size <= _CHECKSUM_BYTES else None
+
+    if found := dataset.id.chunk_iter(short):
+        raise SourceError(
+            "a chunk is too short for its checksum",
+            where,
+            f"more than {_CHECKSUM_BYTES} bytes",
+            f"{found.size} bytes for the chunk at {found.chunk_offset}",
+            "The file is damaged: make the copy or the export again",
         )
 
 
