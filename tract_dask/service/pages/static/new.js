@@ -89,7 +89,7 @@ async function readMovie() {
     at("preview").hidden = true;
     setText(at("source-facts"), "");
     at("source-problem").replaceChildren(h("div", { class: "notice bad", role: "alert" }, h("p", {}, h("b", {}, error.what)), error.expected && h("p", { class: "small" }, `Expected ${error.expected}${error.got ? `; got ${error.got}` : ""}`), h("p", {}, error.remedy)));
-    if (/raw/i.test(error.text ?? error.message)) at("group-source", HTMLDetailsElement).open = true;
+    if (/raw[-_]shape/i.test(error.text ?? error.message)) at("group-source", HTMLDetailsElement).open = true;
   }
   plan();
 }

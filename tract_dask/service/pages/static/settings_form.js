@@ -51,6 +51,7 @@ const TITLES = {
   "metadata.pixel_size_pm": "Pixel size", "metadata.frame_time_s": "Frame time", "metadata.dose": "Dose of a frame", "metadata.gain": "Gain",
   "fit.window_px": "Fit window", "fit.blur_sigma_px": "Blur", "fit.shape": "Shape of a column", "drift.method": "Drift", "columns.method": "Find columns", "columns.contrast": "Columns are",
   "columns.csv": "Table of columns", "drift.csv": "Table of drift", "convert.shard_mb": "Shard",
+  "source.roi": "Field", "source.bin": "Binning",
 };
 
 const UNITS = { "e/A^2": "e/Å²", counts: "counts", px: "px" };
