@@ -352,3 +352,13 @@ def test_a_damaged_text_of_velox_costs_only_what_it_said(damaged: int, tmp_path:
     temperatures = [np.nan if k == damaged else 20.0 + k for k in range(len(FRAMES))]
     np.testing.assert_array_equal(known.along_frames["temperature"].values, temperatures)
     assert any(f"metadata of 1 frames (first {damaged}) are damaged" in note for note in known.notes)
+
+
+def test_units_in_the_names_of_axes_count(tmp_path: Path) -> None:
+    path = hyperspy(
+        tmp_path / "a.hspy",
+        FRAMES,
+        [("Time (ms)", "", 40.0, True), ("Y [nm]", "", 0.02, False), ("X [nm]", "", 0.02, False)],
+    )
+    known = open_source(path).metadata
+    assert (known.pixel_size_pm, known.frame_time_s) == (20.0, 0.04)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
@@ -54,6 +54,28 @@ class Axis:
 
     def __str__(self) -> str:
         return f"{self.name or 'without a name'}{f' ({self.unit})' if self.unit else ''}"
+
+
+_UNIT_IN_NAME = re.compile(r"(.*\S)\s*[(\[]\s*([^()\[\]]+?)\s*[)\]]")
+
+
+def spelled_out(axes: Sequence[Axis]) -> list[Axis]:
+    """Return axes with the units that programs write into their names, where those are units that are known.
+
+    Examples
+    --------
+    >>> [str(axis) for axis in spelled_out([Axis("Time (ms)"), Axis("Y [nm]"), Axis("x (left)")])]
+    ['Time (ms)', 'Y (nm)', 'x (left)']
+    """
+    return [_spelled_out(axis) for axis in axes]
+
+
+def _spelled_out(axis: Axis) -> Axis:
+    found = None if axis.unit else _UNIT_IN_NAME.fullmatch(axis.name)
+    unit = plain_unit(found[2]) if found else ""
+    if not found or not (to_pm(1.0, unit) or to_seconds(1.0, unit) or unit.lower() in _ENERGIES):
+        return axis
+    return replace(axis, name=found[1], unit=found[2])
 
 
 _ENERGIES = ("ev", "kev", "mev", "1/cm", "cm-1", "cm^-1")

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import SourceError
 from ...settings.run import SourceSettings
-from ..axes import Axis, Order, ordered
+from ..axes import Axis, Order, ordered, spelled_out
 from ..blocks import fill_from
 from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
 from ..checks import DAMAGE, MOST_FRAMES, Frames, Permit, checked_dtype, checked_file, reading, widened
@@ -157,6 +157,7 @@ def _one(file: Any, path: Path, shown: str, notes: tuple[str, ...], access: Acce
         behind = files_behind(dataset, access)
         files = tuple(access.files)
         axes, unread = axes_of(dataset, where, file)
+        axes = spelled_out(axes)
         order = ordered(axes, dataset.shape or (), where)
         shape = order.shape(dataset.shape)
         raw_bytes = sum(part.n_bytes for part in behind.raw)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...errors import SourceError
 from ...settings.run import SourceSettings
-from ..axes import Order, ordered
+from ..axes import Order, ordered, spelled_out
 from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
 from ..checks import Frames, Permit, checked_claim, checked_dtype, checked_file, reading, truncated, widened
 from ..hdf5.candidates import ambiguous, movies_of
@@ -93,6 +93,7 @@ def open_zarr(path: Path, inner: str, settings: SourceSettings, permit: Permit |
         axes, convention = axes_of(place, node)
         array = open_node(place, node)
         dtype = checked_dtype(np.dtype(array.dtype), where)
+        axes = spelled_out(axes)
         order = ordered(axes, node.shape, where)
         shape = order.shape(node.shape)
         names, firsts, size = _chunk_files(place, node, order, where)
