@@ -110,7 +110,7 @@ def test_what_is_not_there_cannot_be_compared(lattice):
 def test_frames_that_are_not_there_are_refused_before_the_run(lattice, tmp_path):
     _, movie, _ = lattice
     np.save(tmp_path / "movie.npy", movie.read(0, 3))
-    arguments = ["compare-filters", str(tmp_path / "movie.npy"), str(tmp_path / "out"), "--frames", "3"]
+    arguments = ["compare-filters", str(tmp_path / "movie.npy"), str(tmp_path / "out"), "--frame-numbers", "3"]
     answer = CliRunner().invoke(cli.main, arguments)
     assert answer.exit_code == 2
     assert "Expected 0 to 2; got 3" in answer.output

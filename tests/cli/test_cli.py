@@ -156,7 +156,7 @@ def test_set_names_the_setting_its_range_and_what_it_got(captured, command, assi
     assert not captured
 
 
-@pytest.mark.parametrize(
+WITH_SETTINGS = pytest.mark.parametrize(
     "command",
     [
         "run",
@@ -172,6 +172,18 @@ def test_set_names_the_setting_its_range_and_what_it_got(captured, command, assi
         "simulate table",
     ],
 )
+
+
+@WITH_SETTINGS
+def test_no_option_of_a_command_hides_another(command):
+    found = cli.main
+    for name in command.split():
+        found = found.commands[name]
+    flags = [flag for option in found.params for flag in (*option.opts, *option.secondary_opts)]
+    assert sorted(flags) == sorted(set(flags))
+
+
+@WITH_SETTINGS
 def test_commands_with_settings_take_them_all_alike(command):
     text = tract(*command.split(), "--help").output
     assert {"--set", "--config", "--help-all"} <= set(re.findall(r"^  (--[a-z-]+)", text, flags=re.MULTILINE))

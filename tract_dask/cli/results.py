@@ -41,7 +41,7 @@ def verify(path: Path, *, repair: bool, as_json: bool) -> None:
 @click.command("compare-filters", cls=Command)
 @click.argument("source")
 @click.argument("output", type=PATH)
-@click.option("--frames", type=numbers, default="0", metavar="N,N,...", help="Numbers of the frames [0].")
+@click.option("--frame-numbers", type=numbers, default="0", metavar="N,N,...", help="Frames that are compared [0].")
 @click.option("--column-ids", type=numbers, metavar="N,N,...", help="IDs of the columns; unset: all of them.")
 @common_options
 @setting_options("source", "metadata", "convert", "drift", "columns", "fit", "cluster")
@@ -50,7 +50,7 @@ def compare_filters(
     output: Path,
     settings: RunSettings,
     *,
-    frames: tuple[int, ...],
+    frame_numbers: tuple[int, ...],
     column_ids: tuple[int, ...] | None,
     as_json: bool,
 ) -> None:
@@ -67,10 +67,10 @@ def compare_filters(
         get_ready(settings)
         from ..run.pipeline import run
 
-        filters.check_frames(frames, run(source, output, settings, plan_only=True).frames)
+        filters.check_frames(frame_numbers, run(source, output, settings, plan_only=True).frames)
         with progress() as on_event:
             run(source, output, settings, on_event=on_event)
-    compared, warnings = compare_in_run(run_folder, output, frames, column_ids, settings.fit)
+    compared, warnings = compare_in_run(run_folder, output, frame_numbers, column_ids, settings.fit)
     if as_json:
         click.echo(json.dumps({"rows": list(filters.table_rows(compared)), "warnings": warnings}))
     else:

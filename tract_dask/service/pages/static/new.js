@@ -47,7 +47,7 @@ async function arrive() {
   const path = query.get("source");
   if (path) await choose(path, false);
   else {
-    source = "";
+    [source, about] = ["", null]; // a plan that waits is not asked for
     show(false);
     await browser.open(query.get("folder") ?? "", false);
   }
