@@ -617,3 +617,9 @@ def test_a_store_that_does_not_say_what_is_needed_is_refused_by_name(name, tmp_p
 @pytest.mark.parametrize(("said", "number"), [(2, 2), (2.5, 3), ("3", 3), ("TIFF", 1), (None, 1), (float("inf"), 1)])
 def test_the_number_of_a_format_is_read_however_it_is_written(said, number):
     assert store_metadata.format_of({"format": said}) == number
+
+
+def test_a_store_remembers_what_the_file_says_and_not_what_the_user_does(tmp_path, source):
+    path = convert(source, tmp_path / "movie.zarr", metadata=KNOWN)
+    assert open_movie(path).pixel_size_pm == 8.0
+    assert store_metadata.attributes(path)["file_says"]["pixel_size_pm"] is None

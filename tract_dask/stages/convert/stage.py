@@ -98,7 +98,7 @@ def convert(
         Where a shard could not be written, as on a disk that became full; finished shards are kept.
     """
     started = time.perf_counter()
-    movie = open_source(source, source_settings, metadata) if isinstance(source, str | Path) else source
+    movie = open_source(source, source_settings) if isinstance(source, str | Path) else source
     known = overridden(movie.metadata, metadata, source_settings)
     path = Path(destination).absolute()
     for note in known.notes:
