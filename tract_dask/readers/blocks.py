@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SourceError
-from .checks import Frames, checked_dtype, checked_shape, reading, truncated, widened
-from .source import NOTHING_KNOWN, Source, SourceMetadata
+from .checks import Frames, checked_dtype, checked_shape, truncated, widened
+from .source import NOTHING_KNOWN, FilledSource, SourceMetadata
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class BlockSource(Source):
+class BlockSource(FilledSource):
     """Frames at known places in one file, or in several that are one long row of bytes.
 
     Attributes
@@ -52,17 +52,6 @@ class BlockSource(Source):
         places = self.offsets[start:stop]
         last = bisect_right(self.firsts, int(places.max()) + n_bytes - 1)
         return slice(bisect_right(self.firsts, int(places.min())) - 1, last)
-
-    def _read(self, start: int, stop: int) -> Frames:
-        frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
-        self._fill(start, frames)
-        return frames
-
-    def read_into(self, start: int, frames: Frames) -> None:
-        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
-        with reading(self.path, f"the file cannot be read at frames {start} to {start + len(frames) - 1}"):
-            self._fill(start, frames)
-        self._check_exact(start, frames)
 
     def _fill(self, start: int, frames: Frames) -> None:
         if self.stored.newbyteorder("=") == self.dtype or self.flipped:

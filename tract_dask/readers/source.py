@@ -228,3 +228,23 @@ class Source:
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilledSource(Source):
+    """A source that reads straight into the array that is to hold the frames."""
+
+    def _read(self, start: int, stop: int) -> Frames:
+        frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
+        self._fill(start, frames)
+        return frames
+
+    def read_into(self, start: int, frames: Frames) -> None:
+        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
+        with reading(self.path, f"the file cannot be read at frames {start} to {start + len(frames) - 1}"):
+            self._fill(start, frames)
+        self._check_exact(start, frames)
+
+    def _fill(self, start: int, frames: Frames) -> None:
+        """Fill ``frames`` as :meth:`read_into` does; what libraries raise becomes a SourceError there."""
+        raise NotImplementedError

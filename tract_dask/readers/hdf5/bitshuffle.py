@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..axes import Order
 from ..blocks import fill_from
-from ..checks import Frames, checked_file, reading, truncated, widened
-from ..source import Source
+from ..checks import Frames, checked_file, truncated, widened
+from ..source import FilledSource
 
 FILTER = 32008
 _NONE, _LZ4, _ZSTD = 0, 2, 3
@@ -69,7 +69,7 @@ class Chunks:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class BitshuffledSource(Source):
+class BitshuffledSource(FilledSource):
     """A data set that is read by the places of its chunks.
 
     Attributes
@@ -99,17 +99,6 @@ class BitshuffledSource(Source):
     def one_by_one(self) -> bool:
         """Whether frames that are read one by one take no longer than many at once."""
         return self.order.frame is None or self.chunks.chunk[self.order.frame] == 1
-
-    def _read(self, start: int, stop: int) -> Frames:
-        frames = np.empty((max(0, stop - start), *self.shape[1:]), self.dtype)
-        self._fill(start, frames)
-        return frames
-
-    def read_into(self, start: int, frames: Frames) -> None:
-        """Fill ``frames`` (frames, y, x), contiguous and of this movie's type, with those from ``start`` on."""
-        with reading(self.path, f"the file cannot be read at frames {start} to {start + len(frames) - 1}"):
-            self._fill(start, frames)
-        self._check_exact(start, frames)
 
     def _fill(self, start: int, frames: Frames) -> None:
         checked_file(self.holder)
