@@ -19,6 +19,7 @@ from ..common import work_folder
 
 COMMAND = [sys.executable, "-m", "tract_dask.cli"]
 WAIT_S = 120.0
+_SMALL = "/static/logo.svg"
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ class Pings:
         self._thread.join()
 
     def _ping(self) -> None:
-        while not self._over.wait(0.02):
-            began = time.perf_counter()
-            httpx.get(f"{self._address}/static/logo.svg", timeout=WAIT_S)
-            self.longest_s = max(self.longest_s, time.perf_counter() - began)
+        with httpx.Client(base_url=self._address, timeout=WAIT_S) as client:
+            client.get(_SMALL)  # a connection is made: that takes this process some time, not the service
+            while not self._over.wait(0.02):
+                began = time.perf_counter()
+                client.get(_SMALL)
+                self.longest_s = max(self.longest_s, time.perf_counter() - began)
