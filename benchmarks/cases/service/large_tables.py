@@ -1,7 +1,7 @@
 """What tables of many columns cost the others: ``python -m benchmarks.cases.service.large_tables --columns 200000``.
 
-A finished job with so many columns is read, refined, edited and downloaded. Right: each request is answered or refused by
-name, and meanwhile a small request of somebody else waits for less than 100 ms.
+A finished job with so many columns is read, refined, edited and downloaded. Right: each request is answered or refused
+by name, and meanwhile a small request of somebody else waits for less than 100 ms.
 """
 
 from __future__ import annotations
