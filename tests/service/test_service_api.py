@@ -16,7 +16,7 @@ from tract_dask.run.plan import plan_run
 from tract_dask.service import checks
 from tract_dask.service import events as feeding
 from tract_dask.service.auth.tokens import Access
-from tract_dask.service.events import _POLL_S, EventStreams
+from tract_dask.service.events import EventStreams
 from tract_dask.service.jobs.states import State
 from tract_dask.service.jobs.store import JobStore
 from tract_dask.settings import RunSettings, from_dict, to_dict
@@ -422,7 +422,7 @@ def test_many_streams_take_one_reader_and_all_get_everything(tmp_path):
         await asyncio.gather(*tasks)
         assert all(len(chunks) == 200 for chunks in found)
         assert len({b"".join(chunks) for chunks in found}) == 1
-        looks = (time.perf_counter() - began) / _POLL_S  # of one reader
+        looks = (time.perf_counter() - began) / feeding._POLL_S  # of one reader
         assert reads <= 60 + looks + 1  # each looked once into the past
         assert len(streams) == 0
         assert [chunk async for chunk in streams.listen(0)] == []  # closed for good

@@ -7,18 +7,15 @@ small request of somebody else waits for well under a second.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
-import httpx
 
-from ..common import Clock
-from .started import Pings, started
+from .started import JSON, started
+from .started import tried as tried_on
 
-JSON = {"Content-Type": "application/json"}
 FORM = {"Content-Type": "application/x-www-form-urlencoded"}
 PLAN = b'{"source":"movie.npy","settings":{"fit":'
 BODIES = {
@@ -56,14 +53,7 @@ def main() -> None:
         sparse(service.root)
         files = "/api/v1/files"
 
-        def tried(name: str, request: Callable[[], httpx.Response]) -> None:
-            with Pings(service.address) as pings, Clock() as clock:
-                answer = request()
-            print(
-                f"{name}: {answer.status_code} in {clock.wall_s:.2f} s; others waited {pings.longest_s:.2f} s",
-                flush=True,
-            )
-
+        tried = partial(tried_on, service)
         for name, body in BODIES.items():
             tried(name, partial(client.post, "/api/v1/plan", content=body, headers=JSON))
         for name, body in FORMS.items():

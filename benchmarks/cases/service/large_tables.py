@@ -10,18 +10,18 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import httpx
 import numpy as np
 
-from ..common import Clock
-from .started import Pings, Started, started
+from tract_dask.service.jobs.states import ENDED
+
+from .started import JSON, Started, started
+from .started import tried as tried_on
 
 _SPACING_PX = 8
-_OVER = {"done", "failed", "cancelled"}
 
 
 def submitted(service: Started, client: httpx.Client, n_columns: int) -> str:
@@ -39,7 +39,7 @@ def submitted(service: Started, client: httpx.Client, n_columns: int) -> str:
 
 def waited(client: httpx.Client, job: str) -> str:
     """Wait until a job is over, and return its state."""
-    while (state := client.get(f"/api/v1/jobs/{job}").json()["state"]) not in _OVER:
+    while (state := client.get(f"/api/v1/jobs/{job}").json()["state"]) not in ENDED:
         time.sleep(1)
     return str(state)
 
@@ -54,26 +54,16 @@ def main() -> None:
         print(f"{n_columns} columns: {waited(client, job)}")
         base = f"/api/v1/jobs/{job}"
 
-        def tried(name: str, request: Callable[[], httpx.Response]) -> httpx.Response:
-            with Pings(service.address) as pings, Clock() as clock:
-                answer = request()
-            size = f"{len(answer.content) / 1e6:.1f} MB"
-            print(
-                f"{name}: {answer.status_code}, {size} in {clock.wall_s:.2f} s; others waited {pings.longest_s:.3f} s",
-                flush=True,
-            )
-            return answer
-
+        tried = partial(tried_on, service)
         table = tried("read a version", partial(client.get, f"{base}/columns/0")).json()
         columns: list[dict[str, Any]] = [
             {name: column[name] for name in ("column_id", "x", "y", "kind")} for column in table.get("columns", [])
         ]
         body = json.dumps({"columns": columns}).encode()
-        sent = {"Content-Type": "application/json"}
-        tried("save a version", partial(client.post, f"{base}/columns", content=body, headers=sent))
+        tried("save a version", partial(client.post, f"{base}/columns", content=body, headers=JSON))
         tried("list versions", partial(client.get, f"{base}/columns"))
         tried("read the saved version", partial(client.get, f"{base}/columns/1"))
-        tried("refine", partial(client.post, f"{base}/columns/refine", content=body, headers=sent))
+        tried("refine", partial(client.post, f"{base}/columns/refine", content=body, headers=JSON))
         for part in ("", "/columns", "/frames", "/series/7", "/displacement"):
             tried(f"results{part}", partial(client.get, f"{base}/results{part}"))
         tried("download", partial(client.get, f"{base}/results/download", params={"format": "csv"}))

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +15,11 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from ..common import work_folder
+from ..common import Clock, work_folder
 
 COMMAND = [sys.executable, "-m", "tract_dask.cli"]
 WAIT_S = 120.0
+JSON = {"Content-Type": "application/json"}
 _SMALL = "/static/logo.svg"
 
 
@@ -54,6 +55,15 @@ def started() -> Iterator[Started]:
             process.wait(60)
 
 
+def tried(service: Started, name: str, request: Callable[[], httpx.Response]) -> httpx.Response:
+    """Make a request, print how it ended and how long a small one of somebody else waited, and return its answer."""
+    with Pings(service.address) as pings, Clock() as clock:
+        answer = request()
+    took = f"{answer.status_code}, {len(answer.content) / 1e6:.1f} MB in {clock.wall_s:.2f} s"
+    print(f"{name}: {took}; others waited {pings.longest_s:.3f} s", flush=True)
+    return answer
+
+
 def _token(folder: Path, root: Path, name: str, role: str) -> str:
     file = folder / f"{name}.token"
     create = [*COMMAND, "token", "create", name, "--role", role, "--data-root", str(root), "--file", str(file)]
@@ -73,11 +83,12 @@ class Pings:
 
     def __init__(self, address: str) -> None:
         self.longest_s = 0.0
-        self._address, self._over = address, threading.Event()
+        self._address, self._ready, self._over = address, threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._ping)
 
     def __enter__(self) -> Pings:
         self._thread.start()
+        self._ready.wait(WAIT_S)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -87,7 +98,10 @@ class Pings:
     def _ping(self) -> None:
         with httpx.Client(base_url=self._address, timeout=WAIT_S) as client:
             client.get(_SMALL)  # a connection is made: that takes this process some time, not the service
-            while not self._over.wait(0.02):
+            self._ready.set()
+            while True:  # at least once, however short the request is
                 began = time.perf_counter()
                 client.get(_SMALL)
                 self.longest_s = max(self.longest_s, time.perf_counter() - began)
+                if self._over.wait(0.02):
+                    return
