@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from tract_dask.errors import SourceError
 from tract_dask.readers import READERS, open_cached, open_source
 from tract_dask.readers.blocks import BlockSource
-from tract_dask.readers.listing import FileList
+from tract_dask.readers.movie_files import FileList
 from tract_dask.readers.naming import in_order
 from tract_dask.settings import MetadataSettings, SourceSettings
 

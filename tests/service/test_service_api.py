@@ -16,7 +16,7 @@ from tract_dask.run.plan import plan_run
 from tract_dask.service import checks
 from tract_dask.service import events as feeding
 from tract_dask.service.auth.tokens import Access
-from tract_dask.service.events import EventStreams
+from tract_dask.service.event_streams import EventStreams
 from tract_dask.service.jobs.states import State
 from tract_dask.service.jobs.store import JobStore
 from tract_dask.settings import RunSettings, from_dict, to_dict

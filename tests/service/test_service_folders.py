@@ -16,7 +16,7 @@ import zarr
 from tests.helpers.files_dm import write_seconds
 from tract_dask.errors import InputError, MissingStoreError
 from tract_dask.readers import open_source
-from tract_dask.readers.listing import FileList
+from tract_dask.readers.movie_files import FileList
 from tract_dask.service.app import create_app
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.data_root import DataRoot, OutsideError, Page

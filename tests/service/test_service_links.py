@@ -18,7 +18,7 @@ from serviced import FRAMES, URL, make_app, make_root
 from tract_dask.errors import MissingSourceError, TractError
 from tract_dask.progress import ShardDone, StageStarted
 from tract_dask.readers import READERS, merlin, open_source
-from tract_dask.readers.listing import FileList, list_files
+from tract_dask.readers.movie_files import FileList, list_files
 from tract_dask.service.data_root import Bounds, DataRoot, OutsideError
 from tract_dask.service.jobs.states import State
 from tract_dask.service.outputs import Mark

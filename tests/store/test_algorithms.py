@@ -22,9 +22,8 @@ from tract_dask.stages.fit.job import Job
 from tract_dask.stages.sum import sum_image
 from tract_dask.store import keys
 from tract_dask.store.columns import column_dataset
-from tract_dask.store.keys import KEYED, OTHERWISE, Keyed, counted
+from tract_dask.store.keys import ALGORITHMS, KEYED, OTHERWISE, Keyed, counted, stage_key
 from tract_dask.store.movie import Movie, open_movie
-from tract_dask.store.provenance import ALGORITHMS, stage_key
 from tract_dask.store.results import open_results
 
 GOLDEN = Path(__file__).parent / "golden" / "algorithms.json"
@@ -208,7 +207,7 @@ def test_number_defaults_and_results_of_a_stage_change_together(stage, results):
     found = {"defaults": defaults, "results": [float(f"{value:.5g}") for value in results[stage]]}
     told = (
         f"The defaults or the results of stage {stage} are not those of its algorithm {number}. If that is meant, raise"
-        f" ALGORITHMS[{stage!r}] in tract_dask/store/provenance.py to"
+        f" ALGORITHMS[{stage!r}] in tract_dask/store/keys.py to"
         f" {max(map(int, golden), default=0) + 1}, change the"
         f" defaults in tract_dask/store/keys.py too, and add this under that number to {GOLDEN.name},"
         " where entries stay:\n"

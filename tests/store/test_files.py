@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tract_dask.errors import DestinationError, StoreError
 from tract_dask.settings import FitSettings
-from tract_dask.store import disk, files, metadata, provenance
+from tract_dask.store import disk, files, keys, metadata, provenance
 from tract_dask.store.journal import Journal
 from tract_dask.store.keys import counted
 from tract_dask.store.shards import Shard, split
@@ -31,7 +31,7 @@ def test_a_place_whose_name_is_not_utf8_is_refused(tmp_path):
 
 
 def test_keys_tell_settings_apart_and_parts_from_each_other():
-    key = provenance.stage_key
+    key = keys.stage_key
     assert key("fit", counted("fit", fit=FitSettings())) == key("fit", counted("fit", fit=FitSettings()))
     assert key("fit", counted("fit", fit=FitSettings())) != key("fit", counted("fit", fit=FitSettings(threshold=3.0)))
     assert key("fit", "ab", "c") != key("fit", "a", "bc")

@@ -20,8 +20,8 @@ from ..kernels.windows import Tiles
 from ..settings.run import FitSettings
 from ..stages.fit.lazy import fit_columns
 from ..store import schema
+from ..store.keys import digest_of
 from ..store.movie import Frames, Movie
-from ..store.provenance import digest_of
 from ..store.shard_files import overlaps
 from ..store.shards import Shard
 

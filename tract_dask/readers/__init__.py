@@ -1,45 +1,31 @@
 """Readers: one file a format behind one small protocol.
 
-A format is a function from a path to a :class:`~tract_dask.readers.source.Source` and its line in :data:`BUILT_IN`.
-Other packages add a :class:`~tract_dask.readers.registry.Reader` by an entry point of the group ``tract_dask.readers``.
+A format is a function from a path to a :class:`~tract_dask.readers.source.Source` and its line in
+:data:`~tract_dask.readers.registry.BUILT_IN`. Other packages add a :class:`~tract_dask.readers.reader.Reader` by an
+entry point of the group ``tract_dask.readers``.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from importlib.metadata import entry_points
 from itertools import chain
 from pathlib import Path
 
 from ..errors import SourceError
 from ..settings.run import MetadataSettings, SourceSettings
-from . import video
 from .checks import Permit, checked_file, reading
-from .dm import in_situ as gatan
-from .hdf5 import open_hdf5
-from .hdf5.dectris import is_part
-from .listing import FileList, is_pattern, list_files
-from .merlin import headers_of_mibs, open_merlin
-from .mrc import open_mrc
-from .npy import open_npy
+from .movie_files import FileList, is_pattern, list_files
+from .reader import Reader
 from .recipes import unknown_format
-from .registry import Reader, by_suffix, one_by_one
+from .registry import READERS
 from .selection import overridden, select
-from .seq import belongs_to_seq, open_seq
 from .sequence import SequenceSource, open_sequence
 from .source import FrameSource, Source, SourceMetadata
-from .tia import is_emi, open_tia
-from .tiff import open_tiff
-from .tiff.eer import open_eer
 from .times import agreed
-from .tvips import is_later_part, open_tvips
-from .zarr import open_zarr
-from .zarr.place import is_zarr
 
 __all__ = [
     "READERS",
@@ -54,51 +40,6 @@ __all__ = [
     "open_cached",
     "open_source",
 ]
-
-BUILT_IN = (
-    Reader("TIFF", (".tif", ".tiff", ".stk"), open_tiff),
-    Reader("EER", (".eer",), open_eer, inside="how many readouts are summed into a frame"),
-    Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc, parts=one_by_one(belongs_to_seq)),
-    Reader("NumPy", (".npy",), open_npy),
-    Reader(
-        "HDF5",
-        (".h5", ".hdf5", ".hspy", ".emd", ".nxs"),
-        open_hdf5,
-        inside="the path of a data set",
-        parts=one_by_one(is_part),
-    ),
-    Reader("Zarr", (".zarr", ".zspy"), open_zarr, inside="the path of an array", is_movie=is_zarr),
-    Reader("video", video.SUFFIXES, video.open_video),
-    Reader("TIA", (".ser", ".emi"), open_tia, parts=one_by_one(is_emi)),
-    Reader("TVIPS", (".tvips",), open_tvips, parts=one_by_one(is_later_part)),
-    Reader("StreamPix", (".seq",), open_seq),
-    Reader("Merlin", (".mib", ".hdr"), open_merlin, parts=headers_of_mibs),
-    Reader(
-        "DigitalMicrograph", gatan.SUFFIXES, gatan.open_gatan, inside="the number of an image", is_movie=gatan.is_movie
-    ),
-    Reader("raw", (".raw", ".bin", ".dat"), gatan.open_raw_or_movie, parts=one_by_one(gatan.is_part)),
-)
-"""The formats that are read here."""
-
-
-def _of_others() -> list[Reader]:
-    """Return the readers of other packages; one that cannot be loaded is a warning, and its format stays unknown."""
-    found = []
-    for entry in entry_points(group="tract_dask.readers"):
-        try:
-            reader = entry.load()
-        except Exception as error:  # noqa: BLE001 - whatever another package does when it is imported
-            warnings.warn(f"the reader {entry.name} ({entry.value}) cannot be loaded: {error}", stacklevel=2)
-            continue
-        if isinstance(reader, Reader):
-            found.append(reader)
-        else:
-            warnings.warn(f"the entry point {entry.name} ({entry.value}) does not name a Reader", stacklevel=2)
-    return found
-
-
-READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
-"""The reader of each suffix."""
 
 DECLARED_NOTHING = SourceSettings()
 AS_THE_FILE_SAYS = MetadataSettings()

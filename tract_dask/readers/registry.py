@@ -1,62 +1,67 @@
-"""What a format is here: a name, suffixes, and a function that opens a file."""
+"""The formats that are read: those of this package, and those of others by the entry point ``tract_dask.readers``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TypeAlias
+import warnings
+from importlib.metadata import entry_points
 
-from ..settings.run import SourceSettings
-from .checks import Permit
-from .source import Source
+from . import video
+from .dm import in_situ as gatan
+from .hdf5 import open_hdf5
+from .hdf5.dectris import is_part
+from .merlin import headers_of_mibs, open_merlin
+from .mrc import open_mrc
+from .npy import open_npy
+from .reader import Reader, by_suffix, one_by_one
+from .seq import belongs_to_seq, open_seq
+from .tia import is_emi, open_tia
+from .tiff import open_tiff
+from .tiff.eer import open_eer
+from .tvips import is_later_part, open_tvips
+from .zarr import open_zarr
+from .zarr.place import is_zarr
 
-Opener: TypeAlias = Callable[[Path, str, SourceSettings, Permit | None], Source]
-"""Takes a file or folder, the path inside it, how to read it, and what to ask before other files; makes every check."""
-
-
-def _never(path: Path) -> bool:
-    return False
-
-
-def _none(files: Sequence[Path]) -> set[Path]:
-    return set()
-
-
-def one_by_one(is_part: Callable[[Path], bool]) -> Callable[[Sequence[Path]], set[Path]]:
-    """Return what tells of many files which are parts, from what tells it of one, without a look at its folder."""
-    return lambda files: set(filter(is_part, files))
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A format.
-
-    Attributes
-    ----------
-    name
-        The format's name, for people.
-    suffixes
-        Of its files, in lower case and with the dot.
-    open
-        Opens a movie.
-    inside
-        What may follow a path after two colons, in words; empty where nothing may.
-    is_movie
-        Tells whether a folder is one movie of this format, which ``open`` takes as a whole.
-    parts
-        Takes files of one folder, whose suffixes are these; returns those that only belong to the movie of another file
-        beside them.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    open: Opener
-    inside: str = ""
-    is_movie: Callable[[Path], bool] = _never
-    parts: Callable[[Sequence[Path]], set[Path]] = _none
+BUILT_IN = (
+    Reader("TIFF", (".tif", ".tiff", ".stk"), open_tiff),
+    Reader("EER", (".eer",), open_eer, inside="how many readouts are summed into a frame"),
+    Reader("MRC", (".mrc", ".mrcs", ".st", ".map", ".rec", ".ali"), open_mrc, parts=one_by_one(belongs_to_seq)),
+    Reader("NumPy", (".npy",), open_npy),
+    Reader(
+        "HDF5",
+        (".h5", ".hdf5", ".hspy", ".emd", ".nxs"),
+        open_hdf5,
+        inside="the path of a data set",
+        parts=one_by_one(is_part),
+    ),
+    Reader("Zarr", (".zarr", ".zspy"), open_zarr, inside="the path of an array", is_movie=is_zarr),
+    Reader("video", video.SUFFIXES, video.open_video),
+    Reader("TIA", (".ser", ".emi"), open_tia, parts=one_by_one(is_emi)),
+    Reader("TVIPS", (".tvips",), open_tvips, parts=one_by_one(is_later_part)),
+    Reader("StreamPix", (".seq",), open_seq),
+    Reader("Merlin", (".mib", ".hdr"), open_merlin, parts=headers_of_mibs),
+    Reader(
+        "DigitalMicrograph", gatan.SUFFIXES, gatan.open_gatan, inside="the number of an image", is_movie=gatan.is_movie
+    ),
+    Reader("raw", (".raw", ".bin", ".dat"), gatan.open_raw_or_movie, parts=one_by_one(gatan.is_part)),
+)
+"""The formats that this package reads. A new format is a line here."""
 
 
-def by_suffix(readers: Iterable[Reader]) -> dict[str, Reader]:
-    """Return readers by the suffixes of their files; an earlier one keeps a suffix that a later one has, too."""
-    return {suffix: reader for reader in reversed(tuple(readers)) for suffix in reader.suffixes}
+def _of_others() -> list[Reader]:
+    """Return the readers of other packages; one that cannot be loaded is a warning, and its format stays unknown."""
+    found = []
+    for entry in entry_points(group="tract_dask.readers"):
+        try:
+            reader = entry.load()
+        except Exception as error:  # noqa: BLE001 - whatever another package does when it is imported
+            warnings.warn(f"the reader {entry.name} ({entry.value}) cannot be loaded: {error}", stacklevel=2)
+            continue
+        if isinstance(reader, Reader):
+            found.append(reader)
+        else:
+            warnings.warn(f"the entry point {entry.name} ({entry.value}) does not name a Reader", stacklevel=2)
+    return found
+
+
+READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
+"""The reader of each suffix."""

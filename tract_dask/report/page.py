@@ -24,7 +24,7 @@ from ..settings.declare import Settings
 from ..settings.run import RunSettings
 from ..store import files, metadata
 from ..store.files import read_small
-from ..store.provenance import digest_of
+from ..store.keys import digest_of
 from ..store.results import part_in_words
 from ..store.run_folder import RunFolder
 from ..web import bundle

@@ -13,7 +13,7 @@ from ..errors import DestinationError, InputError, SettingsError, SourceError
 from ..progress import STAGES
 from ..readers import open_source
 from ..readers.checks import Permit
-from ..readers.listing import FileList
+from ..readers.movie_files import FileList
 from ..readers.source import FrameSource
 from ..settings.run import ColumnSettings, DriftSettings, FitSettings, RunSettings
 from ..stages.columns.sites import lattice_sites

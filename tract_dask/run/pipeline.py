@@ -17,7 +17,7 @@ from distributed import Client
 from ..cluster.retries import persist
 from ..progress import REPORT, JsonLines, RunState, Sink, StageDone, StageStarted, Warned, silent, tee
 from ..readers.checks import Permit
-from ..readers.listing import FileList
+from ..readers.movie_files import FileList
 from ..readers.source import FrameSource
 from ..settings.run import RunSettings
 from ..settings.toml import to_toml

@@ -19,7 +19,7 @@ from ..errors import ClusterError, TractError
 from ..progress import STAGES
 from ..readers import open_source
 from ..readers.checks import Permit
-from ..readers.listing import FileList
+from ..readers.movie_files import FileList
 from ..readers.times import has_stamps
 from ..run.checks import check_inputs, check_output
 from ..run.plan import Plan, plan_run

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 from ..errors import DestinationError, InputError, MissingStoreError, StoreError
 from ..readers import READERS, is_movie_folder
-from ..readers.listing import WILD, FileList, list_files
+from ..readers.movie_files import WILD, FileList, list_files
 from ..readers.recipes import unknown_format
 from ..store import metadata
 from ..store.damage import METADATA

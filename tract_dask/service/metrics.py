@@ -20,7 +20,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..progress import REPORT, STAGES
-from .events import EventStreams
+from .event_streams import EventStreams
 from .jobs.records import Job, utc_now
 from .jobs.states import ENDED, State
 from .jobs.store import JobStore

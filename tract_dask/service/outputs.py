@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from ..errors import DestinationError
-from ..readers.listing import WILD
+from ..readers.movie_files import WILD
 from ..store import files
 from ..store.files import read_small
 from ..store.locks import sole_use

@@ -24,7 +24,7 @@ from .auth.headers import host_name
 from .auth.tokens import Access, Role, Token
 from .config import DATABASE, LOCK, LOOPBACK, ServiceConfig, state_folder
 from .data_root import STATE_FOLDER, DataRoot
-from .events import EventStreams
+from .event_streams import EventStreams
 from .jobs.store import JobStore
 
 SHUTDOWN_S = 3

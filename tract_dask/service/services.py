@@ -10,7 +10,7 @@ from starlette.requests import HTTPConnection
 from ..cluster.connect import local_memory_limit
 from .auth.tokens import Access
 from .config import ServiceConfig
-from .events import EventStreams
+from .event_streams import EventStreams
 from .jobs.store import JobStore
 from .metrics import Metrics
 from .process_pool import ProcessPool

@@ -19,9 +19,8 @@ from ..settings.declare import Settings
 from ..store import schema
 from ..store.arrays import load_saved, save_array
 from ..store.journal import Payload
-from ..store.keys import counted
+from ..store.keys import counted, stage_key
 from ..store.movie import Movie
-from ..store.provenance import stage_key
 from ..store.shards import Shard, split
 from .keep import Workers, kept
 

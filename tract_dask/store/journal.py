@@ -113,7 +113,7 @@ class Journal:
     folder
         Made, or cleared, where it holds no journal of this key.
     key
-        Key of the stage (:func:`tract_dask.store.provenance.stage_key`). What was done under another key is
+        Key of the stage (:func:`tract_dask.store.keys.stage_key`). What was done under another key is
         thrown away.
     fields
         What the payloads hold; an entry with less is none.

@@ -1,17 +1,32 @@
-"""Which settings count in the key of which stage, by names that stay.
+"""The keys of stages: an algorithm's number, the settings that count, by names that stay, and what was read.
 
 The names and the released defaults stand here, and not only in the classes of :mod:`tract_dask.settings`: a class that
 is renamed or moved, and a new setting with its default, change no key. A released default is part of its stage's
-algorithm. Where it changes, change it here too, and raise the stage's number in
-:data:`tract_dask.store.provenance.ALGORITHMS`.
+algorithm. Where it changes, change it here too, and raise the stage's number in :data:`ALGORITHMS`.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..settings.declare import Settings
+
+ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
+"""The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
+
+A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds
+number, defaults and results of each stage together.
+"""
+
+Part: TypeAlias = str | bytes | int | float | bool | list[Any] | tuple[Any, ...] | dict[str, Any] | NDArray[Any] | None
+"""What a key can be made of."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +138,34 @@ def counted(stage: str, **groups: Settings) -> dict[str, Any]:
 def default_of(stage: str, name: str) -> Any:
     """Return the released default of a setting by its name in keys; None where there is no such name any more."""
     return next((plain(item.default) for item in KEYED[stage] if item.name == name), None)
+
+
+def stage_key(stage: str, *parts: Part) -> str:
+    """Return the key of a stage's result: a hash of its algorithm's number, its settings and what it read.
+
+    Two results with the same key are the same; a stage is done when its store carries the key that it should have.
+    """
+    return digest_of(stage, ALGORITHMS[stage], *parts)
+
+
+def digest_of(*parts: Part) -> str:
+    """Return a hash of some values, the same on every machine; numbers count by their value, whole ones or not."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = b"".join(_bytes_of(part))
+        digest.update(len(data).to_bytes(8, "big") + data)
+    return digest.hexdigest()
+
+
+def _bytes_of(part: Part) -> Iterator[bytes]:
+    if isinstance(part, bytes):
+        yield part
+    elif isinstance(part, np.ndarray):
+        array = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
+        yield f"{array.dtype.str} {array.shape}".encode()
+        yield array.tobytes()
+    else:
+        yield json.dumps(plain(part), sort_keys=True).encode()
 
 
 def plain(value: Any) -> Any:

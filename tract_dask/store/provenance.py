@@ -11,24 +11,15 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import accumulate, groupby
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from llvmlite.binding import get_host_cpu_name  # type: ignore[import-untyped]
 from numba.core import config
-from numpy.typing import NDArray
 
 from ..kernels.vectors.tracing import LANES
 from ..settings.declare import Settings
 from ..settings.toml import to_toml
-from .keys import plain
-
-ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
-"""The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
-
-A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds
-number, defaults and results of each stage together.
-"""
 
 WHOLE_BYTES = 32 << 20
 """Files that hold no more than this together are read whole for their fingerprint."""
@@ -38,9 +29,6 @@ _SAMPLES = 64
 _SAMPLE_BYTES = 1 << 16
 _FILE_BYTES = 1 << 14
 _GOLDEN = 0.6180339887498949
-
-Part: TypeAlias = str | bytes | int | float | bool | list[Any] | tuple[Any, ...] | dict[str, Any] | NDArray[Any] | None
-"""What a key can be made of."""
 
 
 def fingerprint(*paths: Path) -> str:
@@ -75,34 +63,6 @@ def _samples(sizes: list[int]) -> Iterator[tuple[int, int, int]]:
     if len(sizes) > 1:
         blocks += [(number, max(0, size - _FILE_BYTES) // 2, _FILE_BYTES) for number, size in enumerate(sizes)]
     yield from sorted(set(blocks))
-
-
-def stage_key(stage: str, *parts: Part) -> str:
-    """Return the key of a stage's result: a hash of its algorithm's number, its settings and what it read.
-
-    Two results with the same key are the same; a stage is done when its store carries the key that it should have.
-    """
-    return digest_of(stage, ALGORITHMS[stage], *parts)
-
-
-def digest_of(*parts: Part) -> str:
-    """Return a hash of some values, the same on every machine; numbers count by their value, whole ones or not."""
-    digest = hashlib.sha256()
-    for part in parts:
-        data = b"".join(_bytes_of(part))
-        digest.update(len(data).to_bytes(8, "big") + data)
-    return digest.hexdigest()
-
-
-def _bytes_of(part: Part) -> Iterator[bytes]:
-    if isinstance(part, bytes):
-        yield part
-    elif isinstance(part, np.ndarray):
-        array = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
-        yield f"{array.dtype.str} {array.shape}".encode()
-        yield array.tobytes()
-    else:
-        yield json.dumps(plain(part), sort_keys=True).encode()
 
 
 def provenance(key: str, settings: Settings, source: str = "") -> dict[str, Any]:

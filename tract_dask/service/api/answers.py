@@ -10,7 +10,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from ...readers.listing import FileList
+from ...readers.movie_files import FileList
 from ...store.journal import logs
 
 Version = Annotated[

@@ -10,7 +10,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
-from ..events import EventStreams, chunk, public_record
+from ..event_streams import EventStreams, chunk, public_record
 from ..jobs.records import Job
 from ..jobs.store import JobStore
 from ..services import Served, Services

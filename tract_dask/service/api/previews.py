@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from ...errors import MissingStoreError
-from ...readers.listing import FileList
+from ...readers.movie_files import FileList
 from ...settings.run import MetadataSettings, SourceSettings
 from ...settings.toml import from_dict
 from ...store.damage import METADATA

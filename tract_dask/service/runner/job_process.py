@@ -17,7 +17,7 @@ from typing import Any
 from ...cluster.supervised import Child, how_ended
 from ...errors import ClusterError, TractError
 from ...progress import RunState
-from ...readers.listing import FileList
+from ...readers.movie_files import FileList
 from ...settings.cluster import ClusterSettings
 from ...settings.toml import to_dict
 from ..crashes import crash_of, crashed

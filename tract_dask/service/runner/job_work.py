@@ -20,7 +20,7 @@ from ...cluster.retries import persist
 from ...cluster.tls import using
 from ...errors import ClusterError, ExitCode, TractError
 from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, clock, silent
-from ...readers.listing import FileList
+from ...readers.movie_files import FileList
 from ...run import pipeline
 from ...settings.run import RunSettings
 from ...settings.toml import from_dict

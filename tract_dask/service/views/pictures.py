@@ -27,7 +27,7 @@ from ...errors import InputError
 from ...kernels.greys import TRANSPARENT, grey_levels
 from ...readers import open_cached
 from ...readers.checks import Permit
-from ...readers.listing import FileList
+from ...readers.movie_files import FileList
 from ...readers.source import SourceMetadata
 from ...settings.run import MetadataSettings, SourceSettings
 from ...store import datasets

@@ -35,8 +35,8 @@ from ...store import schema
 from ...store.arrays import load_saved, save_array
 from ...store.columns import column_dataset, positions
 from ...store.journal import Payload
+from ...store.keys import stage_key
 from ...store.movie import Movie
-from ...store.provenance import stage_key
 from ...store.shards import Shard
 from .lattice import Mask, Places, Reals, Relief, binned, find_lattice, pixel_noise, relief
 from .window_size import default_window

@@ -20,8 +20,7 @@ from ...progress import Sink, StageDone, StageStarted, Warned, silent
 from ...settings.run import ColumnSettings, FitSettings
 from ...store import datasets, disk, files, metadata
 from ...store.columns import check_inside, read_columns_csv, write_columns_csv
-from ...store.keys import counted
-from ...store.provenance import stage_key
+from ...store.keys import counted, stage_key
 from ...store.schema import Status
 from ..keep import content, save
 

@@ -14,10 +14,10 @@ from ...readers.checks import reading
 from ...readers.source import FrameSource, Source, SourceMetadata
 from ...settings.run import ConvertSettings, MetadataSettings, SourceSettings
 from ...store import metadata
-from ...store.keys import counted, default_of
+from ...store.keys import ALGORITHMS, counted, default_of, digest_of, stage_key
 from ...store.layout import plan_layout
 from ...store.movie import check_known
-from ...store.provenance import ALGORITHMS, digest_of, fingerprint, stage_key
+from ...store.provenance import fingerprint
 from ...store.stamps import Stamps
 from .create import quantities
 

@@ -34,9 +34,9 @@ from ...settings.run import DriftSettings
 from ...store import schema
 from ...store.arrays import load_array, load_saved, save_array
 from ...store.journal import Fields, Payload
-from ...store.keys import counted
+from ...store.keys import counted, stage_key
 from ...store.movie import Movie
-from ...store.provenance import processor, stage_key
+from ...store.provenance import processor
 from ...store.shards import Shard, Shards, split
 
 Bools = NDArray[np.bool_]

@@ -14,9 +14,8 @@ from ...kernels.registration import Floats
 from ...progress import Sink, StageDone, StageStarted, silent
 from ...settings.run import DriftSettings
 from ...store.files import read_small
-from ...store.keys import counted
+from ...store.keys import counted, stage_key
 from ...store.movie import Movie
-from ...store.provenance import stage_key
 from ...store.tables import decoded, parse_number, parse_table
 from ..keep import Workers, content, kept
 from .measure import drift_dataset, measure_drift

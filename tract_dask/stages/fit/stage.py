@@ -16,10 +16,10 @@ from ...progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from ...settings.run import FitSettings
 from ...store import metadata, results
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
-from ...store.keys import counted
+from ...store.keys import counted, stage_key
 from ...store.movie import Movie
 from ...store.parts import DamagedPartError, write
-from ...store.provenance import processor, stage_key, widths
+from ...store.provenance import processor, widths
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..errors import SourceError
 from .naming import in_order, references
-from .registry import Reader
+from .reader import Reader
 
 WILD = "*?["
 """Signs that make the last part of a path a pattern, unless there is a file or folder of this very name."""
