@@ -15,7 +15,7 @@ import pytest
 
 from tract_dask.cli.options import collect
 from tract_dask.cluster import connect as cluster
-from tract_dask.cluster import forkserver
+from tract_dask.cluster import forkserver, memory
 from tract_dask.cluster.tls import using
 from tract_dask.errors import ClusterError, SettingsError
 from tract_dask.service.runner.cluster_process import ClusterProcess
@@ -53,7 +53,7 @@ def test_local_workers_have_one_thread_each_and_the_memory_that_was_set():
     with cluster.connect(settings) as client:
         cluster.check_workers(client)
         assert client.nthreads() == dict.fromkeys(client.nthreads(), 1)
-        assert cluster.memory_budget(client) == 700_000_000
+        assert memory.memory_budget(client) == 700_000_000
         (found,) = client.run(environment).values()
         names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS", "BLOSC_NTHREADS")
         assert {found[name] for name in names} == {"1"}
@@ -165,7 +165,7 @@ def test_two_schedulers_contradict():
 
 def test_memory_limit_that_is_no_size():
     with pytest.raises(SettingsError, match="not a size"):
-        cluster.local_memory_limit(ClusterSettings(memory_limit="lots"))
+        memory.local_memory_limit(ClusterSettings(memory_limit="lots"))
 
 
 def test_worker_without_the_package_is_named():
@@ -185,8 +185,8 @@ def test_worker_with_another_version_is_named():
 
 
 def test_memory_budget_is_that_of_the_poorest_thread():
-    assert cluster.memory_budget(FakeClient({}, [(8_000, 2), (3_000, 1), (9_000, 1)])) == 3_000
-    assert cluster.memory_budget(FakeClient({}, [(0, 2)])) is None
+    assert memory.memory_budget(FakeClient({}, [(8_000, 2), (3_000, 1), (9_000, 1)])) == 3_000
+    assert memory.memory_budget(FakeClient({}, [(0, 2)])) is None
 
 
 def test_lazy_client_connects_once_and_only_when_asked():

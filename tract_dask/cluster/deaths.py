@@ -16,7 +16,7 @@ from typing import Any
 from distributed import Client, Status
 from distributed.diagnostics.plugin import NannyPlugin
 
-from .supervised import how_ended
+from .child_processes import how_ended
 
 MODULE = __name__
 """What nannies load."""

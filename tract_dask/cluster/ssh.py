@@ -18,7 +18,7 @@ from distributed.utils import get_ip, get_ip_interface
 from ..errors import ClusterError, SettingsError
 from ..settings.cluster import ClusterSettings
 from . import deaths, forkserver
-from .supervised import Supervised
+from .child_processes import Supervised
 from .tls import security, worker_flags
 
 _START_S, _STOP_S = 60.0, 5.0

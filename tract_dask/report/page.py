@@ -32,7 +32,7 @@ from ..web.bundle import STATIC
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import figure_data, windows_data
-from .survey import Survey, residuals, survey
+from .survey import Survey, median, percentiles, residuals, survey
 
 _EVENTS_BYTES = 256 << 20
 
@@ -166,7 +166,7 @@ def _source(run: Survey) -> str:
 def cards(run: Survey) -> list[tuple[str, str, str]]:
     """Return the numbers that stand on top: a name, a value, and what belongs to it."""
     columns, unit = run.columns, run.known.unit
-    spread, expected = _median(columns["spread"]), _median(columns["expected"])
+    spread, expected = median(columns["spread"]), median(columns["expected"])
     drift = run.known.scale * np.ptp(run.frames["drift"].to_numpy(), axis=0)
     n_frames = run.frames.sizes["frame"]
     frame_time = run.tracks.attrs.get("frame_time_s")
@@ -178,7 +178,7 @@ def cards(run: Survey) -> list[tuple[str, str, str]]:
         ("Columns", f"{columns.sizes['column_id']:,}", f"{fitted:,} of them fitted"),
         ("Fits accepted", _percent(run.accepted, run.fits), f"{run.accepted:,} of {run.fits:,}"),
         ("Spread", _number(spread, unit), f"median per axis; stated error {_number(expected, unit)}"),
-        ("R²", _number(_median(columns["r_squared"])), "median of the columns' means"),
+        ("R²", _number(median(columns["r_squared"])), "median of the columns' means"),
         ("Drift", _lengths(drift[::-1], unit), "range along x and y"),
     ]
 
@@ -192,7 +192,7 @@ def quality(run: Survey) -> list[str]:
         "least nine frames of ten."
     ]
     if np.isfinite(columns["spread"]).any():
-        spread, expected = _median(columns["spread"]), _median(columns["expected"])
+        spread, expected = median(columns["spread"]), median(columns["expected"])
         error = f"an error of {_number(expected, run.known.unit)}" if np.isfinite(expected) else "no error"
         said.append(
             f"A column spreads by {_number(spread, run.known.unit)} per axis (median over the columns); the fits state "
@@ -204,14 +204,14 @@ def quality(run: Survey) -> list[str]:
             "are right."
         )
     if np.isfinite(columns["r_squared"]).any():
-        low, high = np.nanpercentile(columns["r_squared"], [5, 95])
+        low, high = percentiles(columns["r_squared"])
         said.append(
-            f"A fit explains {_median(columns['r_squared']):.0%} of the variance in its window (R², median; columns "
+            f"A fit explains {median(columns['r_squared']):.0%} of the variance in its window (R², median; columns "
             f"from {low:.0%} to {high:.0%}). The rest is mostly counting noise where the dose is low."
         )
     if np.isfinite(columns["residual"]).any():
         said.append(
-            f"On the summed image the fits leave {_median(columns['residual']):.1%} of the amplitude (rms, median), "
+            f"On the summed image the fits leave {median(columns['residual']):.1%} of the amplitude (rms, median), "
             f"and {float(np.nanmax(columns['residual'])):.1%} for the worst column."
         )
     outside = columns["outside"].to_numpy()
@@ -373,10 +373,6 @@ def _setting(value: Any) -> str:
 
 def _readable_time(text: str | None) -> str | None:
     return f"{datetime.fromisoformat(text):%Y-%m-%d %H:%M} UTC" if text else None
-
-
-def _median(values: Any) -> float:
-    return float(np.nanmedian(values)) if np.isfinite(values).any() else float("nan")
 
 
 def _percent(part: int, whole: int) -> str:

@@ -217,6 +217,17 @@ def _frames_a_bin(n_frames: int, n_columns: int, values: int) -> int:
     return max(2, -(-n_frames // bins))
 
 
+def median(values: Any) -> float:
+    """Return the median of the finite values; NaN where there are none."""
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else float("nan")
+
+
+def percentiles(values: Any) -> tuple[float, float]:
+    """Return between which values nine tenths of the finite ones lie: their 5th and 95th percentile."""
+    low, high = np.nanpercentile(values, [5, 95])
+    return float(low), float(high)
+
+
 def _settings(path: Path) -> RunSettings | None:
     """Return the settings of the run; None where they are missing or of another version."""
     try:

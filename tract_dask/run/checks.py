@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cluster.connect import local_memory_limit
+from ..cluster.memory import local_memory_limit
 from ..errors import DestinationError, InputError, SettingsError, SourceError
 from ..progress import STAGES
 from ..readers import open_source

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from ..cluster.connect import LazyClient, local_memory_limit, memory_budget
+from ..cluster.connect import LazyClient
+from ..cluster.memory import local_memory_limit, memory_budget
 from ..errors import ClusterError
 from ..settings.run import RunSettings
 from ..store.layout import peak_memory, plan_layout

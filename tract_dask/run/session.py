@@ -15,7 +15,8 @@ from types import TracebackType
 import xarray as xr
 from distributed import Client
 
-from ..cluster.connect import LazyClient, memory_budget
+from ..cluster.connect import LazyClient
+from ..cluster.memory import memory_budget
 from ..cluster.retries import Done, persist
 from ..cluster.tls import open_to_others
 from ..errors import StoreError

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from anyio import to_thread
 
-from ..cluster.connect import local_memory_limit, memory_limit
+from ..cluster.memory import local_memory_limit, memory_limit
 from ..errors import ClusterError, TractError
 from ..progress import STAGES
 from ..readers import open_source

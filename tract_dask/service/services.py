@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
-from ..cluster.connect import local_memory_limit
+from ..cluster.memory import local_memory_limit
 from .auth.tokens import Access
 from .config import ServiceConfig
 from .event_streams import EventStreams

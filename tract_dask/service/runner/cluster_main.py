@@ -15,8 +15,8 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+from ...cluster.child_processes import listen
 from ...cluster.forkserver import uncollected
-from ...cluster.supervised import listen
 
 
 def main() -> None:

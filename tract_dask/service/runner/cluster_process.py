@@ -22,8 +22,8 @@ from urllib.parse import urlsplit
 from distributed.core import rpc
 from distributed.utils import key_split
 
+from ...cluster.child_processes import Supervised
 from ...cluster.connect import scheduler_address
-from ...cluster.supervised import Supervised
 from ...cluster.tls import checked_address, in_memory, security, temporary_credentials, web_context
 from ...errors import ClusterError
 from ...settings.cluster import ClusterSettings

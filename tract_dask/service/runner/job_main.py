@@ -14,8 +14,8 @@ import threading
 from queue import SimpleQueue
 from typing import Any
 
+from ...cluster.child_processes import listen
 from ...cluster.forkserver import uncollected
-from ...cluster.supervised import listen
 from ...errors import ExitCode
 
 

@@ -14,7 +14,7 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Any
 
-from ...cluster.supervised import Child, how_ended
+from ...cluster.child_processes import Child, how_ended
 from ...errors import ClusterError, TractError
 from ...progress import RunState
 from ...readers.movie_files import FileList

@@ -8,7 +8,7 @@ import time
 import psutil
 import pytest
 
-from tract_dask.cluster.supervised import Child, Supervised, how_ended
+from tract_dask.cluster.child_processes import Child, Supervised, how_ended
 
 ECHO = """
 import sys
@@ -71,7 +71,7 @@ def test_what_it_started_ends_with_it_and_does_not_hold_its_lines_open():
     ],
 )
 def test_what_is_supervised_is_started_again_and_says_why_it_ended(monkeypatch, code, problem):
-    monkeypatch.setattr("tract_dask.cluster.supervised._SHORTEST_S", 0.01)
+    monkeypatch.setattr("tract_dask.cluster.child_processes._SHORTEST_S", 0.01)
     ends, thrice = [], threading.Event()
 
     def ended() -> None:
