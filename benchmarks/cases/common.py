@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,8 +18,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import tract_dask as td
-from tract_dask.settings import ColumnSettings, FitSettings, MetadataSettings
+from tract_dask.progress import Event, to_record
+from tract_dask.report.findings import findings
+from tract_dask.report.survey import survey
+from tract_dask.settings import ColumnSettings, FitSettings, MetadataSettings, RunSettings, to_toml
+from tract_dask.stages.fit.job import prepare
+from tract_dask.stages.fit.stage import fit_movie
+from tract_dask.store import datasets
 from tract_dask.store.movie import Movie
+from tract_dask.store.run_folder import RunFolder
 
 Floats = NDArray[np.float64]
 
@@ -117,15 +125,38 @@ def crystal(
 
 
 def track(counts: NDArray[Any], folder: Path, fit: dict[str, Any], columns: dict[str, Any]) -> tuple[xr.Dataset, Movie]:
-    """Convert a movie into ``folder`` and track it in this process; settings of fit and columns by name."""
+    """Convert a movie into ``folder`` and track it in this process; settings of fit and columns by name.
+
+    The folder is then that of a run, for :func:`warnings_of`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    places, events = RunFolder(folder), list[Event]()
     np.save(folder / "movie.npy", counts)
     td.convert(folder / "movie.npy", folder / "movie.zarr", metadata=CALIBRATION, overwrite=True)
     movie = td.open_movie(folder / "movie.zarr")
-    drift = td.estimate_drift(movie)
+    settings = RunSettings(columns=ColumnSettings(**columns), fit=FitSettings(**fit))
+    drift = td.estimate_drift(movie, on_event=events.append)
     summed = td.sum_image(movie, drift)
-    found = td.find_columns(summed, ColumnSettings(**columns))
-    return td.fit_columns(movie, found, drift, FitSettings(**fit), summed=summed).load(), movie
+    found = td.find_columns(summed, settings.columns)
+    fit_movie(movie, prepare(movie, found, drift, settings.fit, summed=summed), places.results, on_event=events.append)
+    for dataset, path in ((drift, places.drift), (summed, places.sum)):
+        datasets.write_dataset(without_unset(dataset), path)
+    places.settings.write_text(to_toml(settings))
+    places.events.write_text("".join(f"{json.dumps(to_record(event))}\n" for event in events))
+    return td.open_results(places.results).load(), movie
+
+
+def without_unset(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a Dataset without the attributes that are None, which no store takes."""
+    stored = dataset.copy()
+    stored.attrs = {name: value for name, value in dataset.attrs.items() if value is not None}
+    return stored
+
+
+def warnings_of(folder: Path) -> list[str]:
+    """Return the names of the warnings of a run, such as :func:`track` leaves it."""
+    events = [json.loads(line) for line in RunFolder(folder).events.read_text().splitlines()]
+    return [finding.name for finding in findings(survey(folder, events)) if finding.serious]
 
 
 def placed(tracks: xr.Dataset) -> Floats:
@@ -150,6 +181,10 @@ class Score:
         Share of the fits of found columns that nothing speaks against.
     rmse, bias
         Root mean square error of a coordinate, and that of the columns' means, px.
+    scatter
+        Standard deviation of a coordinate about its column's mean error, px.
+    bias_in_errors
+        Root mean square of the columns' mean errors over the stated errors of these means; 1 is right.
     pull
         Root mean square of error over stated error; 1 is right.
     unstated
@@ -167,6 +202,8 @@ class Score:
     pull: float
     unstated: float
     accepted_absent: float
+    scatter: float
+    bias_in_errors: float
 
     def __str__(self) -> str:
         absent = "" if np.isnan(self.accepted_absent) else f"; accepted while absent {self.accepted_absent:.1%}"
@@ -195,8 +232,13 @@ def score(tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: 
     absent = ~there[:, known]
     accepted_absent = np.isfinite(errors[absent][:, 0])
     errors[absent] = np.nan
-    pulls = errors / stated[:, which[known]]
+    stated = stated[:, which[known]]
+    pulls = errors / stated
     judged = np.isfinite(errors)
+    counted = judged & np.isfinite(stated)
+    n, mean = counted.sum(axis=0), np.where(counted, errors, 0).sum(axis=0) / np.maximum(counted.sum(axis=0), 1)
+    of_mean = np.sqrt(np.where(counted, stated**2, 0).sum(axis=0)) / np.maximum(n, 1)
+    deviations = np.where(judged, errors - mean, 0)[:, (n > 1).all(axis=1)]
     pulls = pulls[judged & np.isfinite(pulls)]
     return Score(
         found=len(known),
@@ -208,6 +250,8 @@ def score(tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: 
         bias=float(np.sqrt(np.nanmean(np.nanmean(errors, axis=0) ** 2))) if len(known) else np.nan,
         pull=float(np.sqrt((pulls**2).mean())) if pulls.size else np.nan,
         unstated=float(1 - pulls.size / max(1, judged.sum())),
+        scatter=float(np.sqrt((deviations**2).sum() / max(1, (n[(n > 1).all(axis=1)] - 1).sum()))),
+        bias_in_errors=float(np.sqrt(np.mean((mean / of_mean)[n > 0] ** 2))) if (n > 0).any() else np.nan,
     )
 
 

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from tract_dask.analysis.jumps import change_points
 
-from ..common import Floats, Scene, crystal, score, track, walk, work_folder
+from ..common import Floats, Scene, crystal, lattice, score, track, walk, work_folder
 from .bounds import bound
 
 WINDOW = 21
@@ -33,6 +33,12 @@ class Trial:
     fit: dict[str, Any] = field(default_factory=dict)
     columns: dict[str, Any] = field(default_factory=dict)
     tolerance: float = 6.0
+    border: float = 25.0
+
+    def cut(self, n_frames: int) -> Trial:
+        """Return the same with no more than the first frames."""
+        scene = replace(self.scene, places=self.scene.places[:n_frames], amplitudes=self.scene.amplitudes[:n_frames])
+        return replace(self, scene=scene, counts=self.counts[:n_frames])
 
 
 def plain() -> Iterator[Trial]:
@@ -130,6 +136,9 @@ def vacuum_that_is_darker() -> Iterator[Trial]:
             scene, amplitudes=np.where(absent, 0, scene.amplitudes), background=np.broadcast_to(level, scene.shape)
         )
         yield Trial(f"vacuum {share} of the crystal", own, own.counts(), columns={"spacing_px": 40.0})
+        yield Trial(f"vacuum {share} of the crystal, spacing not given", own, own.counts())
+        strong = replace(own, amplitudes=own.amplitudes / 0.3)
+        yield Trial(f"vacuum {share} of the crystal, contrast 1", strong, strong.counts())
 
 
 def black_border() -> Iterator[Trial]:
@@ -149,6 +158,78 @@ def few_electrons() -> Iterator[Trial]:
             yield Trial(f"{dose} e/A^2, contrast {contrast}", scene, scene.counts())
 
 
+def dark_columns() -> Iterator[Trial]:
+    """Columns that are darker than their surroundings, with the defaults. Right: scores as of `plain`."""
+    for contrast in (0.3, 0.45, 0.68):
+        scene, _ = crystal(background=12.8, contrast=-contrast)
+        yield Trial(f"dark, contrast {contrast}", scene, scene.counts())
+    scene, _ = crystal(background=12.8, contrast=-0.45)
+    step = np.where(np.arange(scene.shape[0]) < 60, 2.0, 1.0)[:, None] * 12.8
+    own = replace(scene, background=np.broadcast_to(step, scene.shape))
+    yield Trial("dark, beside a bright vacuum", own, own.counts())
+
+
+def lost_frames() -> Iterator[Trial]:
+    """The crystal is away for some frames, or out of focus. Right: no fit of these frames is accepted."""
+    scene, _ = crystal(background=6.4)
+    away = np.zeros(len(scene.places), bool)
+    away[[6, *range(14, 19)]] = True
+    gone = replace(scene, amplitudes=np.where(away[:, None], 0, scene.amplitudes))
+    yield Trial("crystal away in 6 frames", gone, gone.counts())
+    wide = replace(scene, sigma=14.0, amplitudes=scene.amplitudes * (scene.sigma / 14) ** 2)
+    blurred = replace(gone, places=scene.places)
+    counts = np.where(away[:, None, None], wide.counts(), scene.counts())
+    yield Trial("out of focus in 6 frames", blurred, counts)
+
+
+def without_numbers() -> Iterator[Trial]:
+    """Pixels that are NaN: one, a line, a border. Right: only fits whose windows hold them suffer."""
+    scene, _ = crystal()
+    for name, where in (
+        ("one pixel", (slice(None), 200, 180)),
+        ("a line", (slice(None), 200)),
+        ("a border of 30 px", (slice(None), slice(None), slice(0, 30))),
+    ):
+        counts = scene.counts().astype("f4")
+        counts[where] = np.nan
+        yield Trial(f"NaN in {name}", scene, counts)
+
+
+def gain_patterns() -> Iterator[Trial]:
+    """Every pixel has a gain that stays. Right: errors and pulls as of the same dose without."""
+    scene, _ = crystal(background=32.0)
+    for share in (0.05, 0.1):
+        pattern = 1 + np.random.default_rng(8).normal(0, share, scene.shape)
+        own = replace(scene, background=32.0)
+        yield Trial(f"gain pattern of {share:.0%}", own, _patterned(own, pattern))
+
+
+def samplings() -> Iterator[Trial]:
+    """Columns of 12 to 80 px apart, and narrow ones. Right: pull 1, errors near the bound."""
+    for spacing in (12.0, 20.0, 40.0, 80.0):
+        side = int(7 * spacing)
+        sites = lattice((side, side), spacing)
+        places = sites + np.random.default_rng(int(spacing)).normal(0, 0.2, (24, *sites.shape))
+        scene = Scene(places, np.full(places.shape[:2], 30.0), 0.15 * spacing, 10.0, (side, side))
+        yield Trial(f"spacing {spacing:g} px", scene, scene.counts(), border=spacing, tolerance=spacing / 5)
+    for sigma in (0.8, 1.2):
+        scene, _ = crystal(shape=(160, 160), spacing=8 * sigma, sigma=sigma, background=50.0, top=40.0, step=0.1)
+        yield Trial(f"sigma {sigma} px", scene, scene.counts(), border=8.0, tolerance=8 * sigma / 5)
+
+
+def high_contrast() -> Iterator[Trial]:
+    """Columns four times as bright as the vacuum, and nothing but vacuum."""
+    scene, _ = crystal(contrast=4.0)
+    for fit in ({}, {"estimator": "poisson"}):
+        yield Trial(f"contrast 4 {fit}", scene, scene.counts(), fit)
+    empty = replace(scene, amplitudes=np.zeros_like(scene.amplitudes))
+    yield Trial("noise alone", empty, empty.counts())
+
+
+def _patterned(scene: Scene, pattern: Floats) -> NDArray[Any]:
+    return np.random.default_rng(11).poisson(scene.expected * pattern).astype("u2")
+
+
 SCENES: dict[str, Callable[[], Iterator[Trial]]] = {
     make.__name__: make
     for make in (
@@ -162,6 +243,12 @@ SCENES: dict[str, Callable[[], Iterator[Trial]]] = {
         vacuum_that_is_darker,
         black_border,
         few_electrons,
+        dark_columns,
+        lost_frames,
+        without_numbers,
+        gain_patterns,
+        samplings,
+        high_contrast,
     )
 }
 
@@ -175,7 +262,7 @@ def run(trial: Trial) -> str:
     """Track a movie, and return its line."""
     with work_folder() as folder:
         tracks, _ = track(trial.counts, folder, trial.fit, trial.columns)
-        found = score(tracks, trial.scene, tolerance=trial.tolerance)
+        found = score(tracks, trial.scene, border=trial.border, tolerance=trial.tolerance)
         jumps = change_points(tracks, 0.99)
     background = float(np.mean(trial.scene.background))
     least = bound(float(np.median(trial.scene.amplitudes.max(axis=0))), trial.scene.sigma, background, WINDOW)[0]
