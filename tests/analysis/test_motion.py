@@ -11,7 +11,6 @@ from scipy import stats
 
 from tract_dask.analysis.jumps import (
     _jumps,
-    _scatter,
     activation_energy,
     chance,
     change_points,
@@ -19,7 +18,15 @@ from tract_dask.analysis.jumps import (
     noise_factor,
     threshold_jumps,
 )
-from tract_dask.analysis.motion import displacement, lattice_displacement, positions, spread, standard_deviation
+from tract_dask.analysis.motion import (
+    displacement,
+    lattice_displacement,
+    positions,
+    spread,
+    standard_deviation,
+    standard_errors,
+)
+from tract_dask.analysis.weights import _scatter, blocks
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.changepoints import critical_penalty, plateaus
 from tract_dask.kernels.gaussian import parameters
@@ -148,6 +155,33 @@ def test_change_points_of_still_columns_come_as_often_as_stated(n_frames, n_colu
     low, high = stats.binom.ppf([5e-4, 1 - 5e-4], n_columns, [0.08, 0.12])
     assert low <= alarms <= high
     assert (found["p_value"] <= 0.1 + 1e-9).all()
+
+
+def test_errors_that_follow_the_noise_of_their_frame_raise_no_alarm():
+    """Stated errors scatter by two fifths from frame to frame, as a faint column's do; levels hold within 2 points."""
+    n_columns = 1500
+    rng = np.random.default_rng(4)
+    stated = 2.0 * np.exp(0.4 * rng.normal(size=(40, n_columns)))
+    tracks = tracks_of(still(40, n_columns, seed=2), stderr_pm=stated)
+    for level in (0.1, 0.05, 0.01):
+        alarms = len(np.unique(change_points(tracks, 1 - level)["column_id"])) / n_columns
+        assert abs(alarms - level) <= 0.02 + 3 * np.sqrt(level / n_columns)
+        moved = (displacement(tracks, 5, 30)["p_value"] < level).mean()
+        assert abs(moved - level) <= 0.02 + 3 * np.sqrt(level / n_columns)
+
+
+def test_errors_follow_the_dose_and_a_column_that_changes():
+    """A flicker that all columns share, and a column that becomes fainter, count; the noise of one frame does not."""
+    rng = np.random.default_rng(6)
+    truth = np.full((300, 200), 2.0)
+    truth[100:110] *= 2
+    truth[150:, 0] *= 2
+    stated = tracks_of(still(300, 200), stderr_pm=truth * np.exp(0.3 * rng.normal(size=truth.shape)))
+    ((_, _, found),) = blocks(positions(stated), standard_errors(stated))
+    away = np.abs(np.arange(300) - 150) > 25
+    assert np.abs(found[0, away, 0] / truth[away, 0] - 1).max() <= 0.25
+    assert np.quantile(np.abs(found[1:, :, 0].T / truth[:, 1:] - 1), 0.999) <= 0.25
+    assert np.std(found[1:, :, 0].T / truth[:, 1:]) <= 0.08
 
 
 def test_a_column_by_itself_does_not_alarm_more_often():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -18,23 +16,10 @@ from ..kernels.changepoints import gains, plateaus
 from ..kernels.gaussian.intensity import Floats
 from ..store import schema
 from .motion import frame_times, named, positions, standard_errors
+from .weights import blocks, drawn_together, scatter_of
 
-_BLOCK_BYTES = 128 << 20
-"""Columns are read in blocks of so many bytes: places and errors of all their frames."""
 _PARTS = 64
 """A block is worked through in so many parts, side by side."""
-_CUT = 2.5
-"""First differences beyond so many standard deviations are jumps, and do not count in the noise."""
-_CUT_VARIANCE = 1 - math.sqrt(2 / math.pi) * _CUT * math.exp(-(_CUT**2) / 2) / math.erf(_CUT / math.sqrt(2))
-"""Variance of a standard normal variable that is cut there."""
-_CORRELATED = 2.05
-"""So many differences tell as much of the noise as one normal variable: neighbours share a frame, and they are cut.
-
-From simulated normal noise; it is the same for 40 and for 2000 frames."""
-_MEDIAN = np.pi / 2
-"""Variance of a median, against that of the mean."""
-_FARTHEST = 2.0
-"""A column's noise is drawn towards that of all by no more than so many standard errors (Efron and Morris 1971)."""
 _BOLTZMANN_EV = 8.617333262e-5
 
 
@@ -109,8 +94,9 @@ def change_points(tracks: xr.Dataset, confidence: float = 0.95, shortest: int = 
 
     Notes
     -----
-    Errors are the fits' own, times the factor of :func:`noise_factor`. Noise is taken as independent from frame to
-    frame. A column that wanders is cut into steps.
+    Errors are what the fits of the column state around a frame, as a median that does not follow the noise of one
+    frame (:mod:`tract_dask.analysis.weights`), times the factor of :func:`noise_factor`. Noise is taken as independent
+    from frame to frame. A column that wanders is cut into steps.
     """
     if not 0 < confidence < 1:
         raise SettingsError("the confidence is out of range", "confidence", "between 0 and 1", f"{confidence:g}")
@@ -118,7 +104,7 @@ def change_points(tracks: xr.Dataset, confidence: float = 0.95, shortest: int = 
         raise SettingsError("a plateau needs a frame", "shortest", "1 or more", f"{shortest}")
     factors = noise_factor(tracks)
     found: list[tuple[NDArray[Any], ...]] = []
-    for start, places, errors in _blocks(tracks):
+    for start, places, errors in blocks(positions(tracks), standard_errors(tracks)):
         own = factors.isel(column_id=slice(start, start + len(places)))
         scaled, degrees = errors * own["factor"].to_numpy()[:, None, None], own["degrees"].to_numpy()
         jobs = [
@@ -158,26 +144,8 @@ def noise_factor(tracks: xr.Dataset) -> xr.Dataset:
         Over column_id: ``factor`` (1: the errors are right), and ``degrees``, the degrees of freedom with which it is
         known. 1 and 1 where no column has two frames.
     """
-    scatters = [
-        _scatter(place, error)
-        for _, places, errors in _blocks(tracks)
-        for place, error in zip(places, errors, strict=True)
-    ]
-    own, variance = np.array(scatters).T
-    known = np.isfinite(own)
-    factor, degrees = np.ones(len(own)), np.ones(len(own))
-    if known.any():
-        common, typical = float(np.median(own[known])), float(np.median(variance[known]))
-        scatter = 1.4826 * float(np.median(np.abs(own[known] - common)))
-        between = max(scatter**2 - typical, 0.0)
-        own, variance = np.where(known, own, common), np.where(known, variance, np.inf)
-        weight = between / (between + variance)
-        drawn, limit = weight * own + (1 - weight) * common, _FARTHEST * np.sqrt(variance)
-        of_common = _MEDIAN * (between + typical) / known.sum()
-        within = np.abs(drawn - own) <= limit
-        factor = np.exp(0.5 * np.where(within, drawn, own + np.clip(drawn - own, -limit, limit)))
-        shared = np.where(weight > 0, between * (1 - weight), 0.0) + (1 - weight) ** 2 * of_common
-        degrees = 2 / np.where(within, shared, variance)
+    parts = [scatter_of(*block[1:]) for block in blocks(positions(tracks), standard_errors(tracks))]
+    factor, degrees = drawn_together(np.concatenate(parts))
     columns = {"column_id": tracks["column_id"]}
     return xr.Dataset(
         {
@@ -339,29 +307,6 @@ def _jumps(
     jumps = plateaus(values, weights, penalty, shortest)
     step, variance, gain = gains(values, weights, jumps)
     return frames[jumps], step, np.sqrt(variance), chance(degrees * np.log1p(gain / degrees), n)
-
-
-def _scatter(place: Floats, error: Floats) -> tuple[float, float]:
-    """Return the logarithm of a column's variance in units of its stated one, and the variance of that logarithm."""
-    known = np.isfinite(place).all(axis=1) & (error > 0).all(axis=1)
-    variance = error[known] ** 2
-    differences = np.abs(np.diff(place[known], axis=0) / np.sqrt(variance[1:] + variance[:-1])).ravel()
-    if not len(differences) or not np.median(differences) > 0:
-        return np.nan, np.nan
-    sd = 1.4826 * float(np.median(differences))
-    for _ in range(10):
-        sd = float(np.sqrt(np.mean(differences[differences <= _CUT * sd] ** 2) / _CUT_VARIANCE))
-    return 2 * np.log(sd), 2 * _CORRELATED / len(differences)
-
-
-def _blocks(tracks: xr.Dataset) -> Iterator[tuple[int, Floats, Floats]]:
-    """Yield blocks of columns: the first one's number, and their places and errors (column, frame, axis) in pm."""
-    place, error = positions(tracks), standard_errors(tracks)
-    step = max(1, _BLOCK_BYTES // (32 * max(place.sizes["frame"], 1)))
-    for start in range(0, place.sizes["column_id"], step):
-        both = xr.Dataset({"place": place, "error": error}).isel(column_id=slice(start, start + step)).compute()
-        both = both.transpose("column_id", "frame", "axis")
-        yield start, np.ascontiguousarray(both["place"]), np.ascontiguousarray(both["error"])
 
 
 def _table(column: NDArray[np.int64], frame: NDArray[np.int64], step: Floats) -> xr.Dataset:

@@ -11,6 +11,14 @@ from numpy.typing import NDArray
 from ..errors import SettingsError
 from ..store import results, schema
 from .sites import fit_sites
+from .weights import blocks, drawn_together, scatter_of
+
+_AROUND = 100
+"""Frames on each side of a frame that say how large a column's error is there."""
+_FEWEST = 10
+"""Accepted frames from which on the scatter of places scales their errors."""
+_EXACT = 1e9
+"""Degrees of freedom of an error that is taken as known."""
 
 
 def pixel_size_pm(tracks: xr.Dataset) -> float:
@@ -155,7 +163,8 @@ def displacement(tracks: xr.Dataset, first: int, second: int) -> xr.Dataset:
     Dataset
         Over column_id: ``displacement`` (column_id, axis) with its ``stderr``, ``distance``, all in pm, and
         ``p_value``, the probability of such a displacement in units of its error, or a larger one, for a column that
-        keeps still: exp(-χ²/2), with χ² the sum of both axes' squares. NaN where a fit is not accepted.
+        keeps still: (1 + χ²/d)^(-d/2), with χ² the sum of both axes' squares and d the degrees of freedom with which
+        the error is known. NaN where a fit is not accepted.
 
     Raises
     ------
@@ -164,8 +173,11 @@ def displacement(tracks: xr.Dataset, first: int, second: int) -> xr.Dataset:
 
     Notes
     -----
-    The errors are those of the fits, without that of the drift, which moves all columns alike. The paper compares
-    displacements with the spread of columns that keep still (section 3.2, Figure 3); for that use :func:`spread`.
+    The errors are the medians of what the column's fits state in the hundred frames on each side, times how far its
+    places scatter from frame to frame there against what the fits state (:mod:`tract_dask.analysis.weights`); of fewer
+    than ten frames they are taken as stated. That of the drift, which moves all columns alike, is not in them. The
+    paper compares displacements with the spread of columns that keep still (section 3.2, Figure 3); for that use
+    :func:`spread`.
     """
     frames = tracks["frame"].to_numpy()
     for frame in (first, second):
@@ -173,19 +185,41 @@ def displacement(tracks: xr.Dataset, first: int, second: int) -> xr.Dataset:
             raise SettingsError(
                 "there is no such frame", "displacement", f"a frame from {frames[0]} to {frames[-1]}", f"{frame}"
             )
-    place, error = (values.sel(frame=[first, second]) for values in (positions(tracks), standard_errors(tracks)))
+    numbers = [int(np.flatnonzero(frames == frame)[0]) for frame in (first, second)]
+    around = sorted({k for n in numbers for k in range(max(n - _AROUND, 0), min(n + _AROUND + 1, len(frames)))})
+    place, stated = (
+        values.isel(frame=around).transpose("frame", "column_id", "axis")
+        for values in (positions(tracks), standard_errors(tracks))
+    )
+    error, degrees = _scaled_errors(place, stated)
+    place, error = (values.sel(frame=[first, second]) for values in (place, error))
     moved = place.isel(frame=1, drop=True) - place.isel(frame=0, drop=True)
-    stderr = (error**2).sum("frame", skipna=False) ** 0.5
+    stderr = (error**2).sum("frame", skipna=False).where(moved.notnull()) ** 0.5
     chi_squared = ((moved / stderr) ** 2).sum("axis", skipna=False)
+    p_value = xr.ufuncs.exp(-degrees / 2 * xr.ufuncs.log1p(chi_squared / degrees))
     return xr.Dataset(
         {
             "displacement": named(moved, "pm", f"Displacement from frame {first} to frame {second}"),
             "distance": named(_length(moved), "pm", "Length of the displacement"),
             "stderr": named(stderr, "pm", "Standard error of the displacement"),
-            "p_value": named(xr.ufuncs.exp(-chi_squared / 2), "1", "Probability of as much or more without motion"),
+            "p_value": named(p_value, "1", "Probability of as much or more without motion"),
         },
         attrs={"first": first, "second": second},
     )
+
+
+def _scaled_errors(place: xr.DataArray, stated: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return the errors of places, as far as these scatter, and the degrees of freedom (column_id) of that scale."""
+    steady, scatters = [], []
+    for _, places, errors in blocks(place, stated):
+        steady.append(errors.transpose(1, 0, 2))
+        scatters.append(scatter_of(places, errors))
+    error = place.copy(data=np.concatenate(steady, axis=1))
+    factor, degrees = drawn_together(np.concatenate(scatters))
+    few = place.notnull().all("axis").sum("frame").to_numpy() < _FEWEST
+    column = {"column_id": place["column_id"]}
+    scale, known = np.where(few, 1.0, factor), np.where(few, _EXACT, degrees)
+    return error * xr.DataArray(scale, column, ("column_id",)), xr.DataArray(known, column, ("column_id",))
 
 
 def standard_deviation(values: xr.DataArray) -> xr.DataArray:
