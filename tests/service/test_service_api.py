@@ -14,7 +14,7 @@ from serviced import FRAMES, URL, listening, make_app
 
 from tract_dask.run.plan import plan_run
 from tract_dask.service import checks
-from tract_dask.service import events as feeding
+from tract_dask.service import event_streams as feeding
 from tract_dask.service.auth.tokens import Access
 from tract_dask.service.event_streams import EventStreams
 from tract_dask.service.jobs.states import State
