@@ -242,9 +242,9 @@ def test_two_runs_in_one_folder(job):
         job()
 
 
-def test_frames_with_nan_end_as_bad_frames(npy, scene, tmp_path, client):
+def test_frames_without_numbers_end_as_bad_frames(npy, scene, tmp_path, client):
     frames = scene.counts().astype(np.float32)
-    frames[5, 80, 70] = np.nan
+    frames[5], frames[7, 80, 70] = np.nan, np.nan
     outcome = Job(npy(frames), tmp_path / "out", client)()
     assert (outcome.state, outcome.bad_frames) == ("done_with_bad_frames", 1)
 

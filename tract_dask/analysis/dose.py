@@ -178,14 +178,16 @@ class SummedFrames(Movie):
     def statistics(self) -> xr.Dataset:
         """Return what the source's statistics tell of the sums without reading them, on ``t``, in memory.
 
-        All are sums of the frames': so no pixel is smaller than ``frame_min`` or larger than ``frame_max``, but there
-        need not be one of that value. There is no ``frame_std``.
+        They are sums of the frames': so no pixel is smaller than ``frame_min`` or larger than ``frame_max``, but there
+        need not be one of that value. ``frame_bad_pixels`` is that of the worst frame. There is no ``frame_std``.
         """
         frames = self.source.statistics().isel(t=slice(self.n * self.n_frames))
         sums = {
             name: ("t", frames[name].to_numpy().reshape(-1, self.n).sum(axis=1), frames[name].attrs)
-            for name in ("frame_min", "frame_max", "frame_mean", "frame_bad_pixels")
+            for name in ("frame_min", "frame_max", "frame_mean")
         }
+        missing = frames["frame_bad_pixels"]
+        sums["frame_bad_pixels"] = ("t", missing.to_numpy().reshape(-1, self.n).max(axis=1), missing.attrs)
         return xr.Dataset(sums, {"t": frames["t"][:: self.n]})
 
     @property

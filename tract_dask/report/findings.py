@@ -156,7 +156,8 @@ def _frames(run: Survey) -> Iterator[Finding]:
     frames = run.frames["frame"].to_numpy()
     bad = run.frames["bad"].to_numpy()
     if bad.any():
-        text = f"{count(int(bad.sum()), 'frame')} ({named(frames[bad].tolist())}) have pixels that are NaN or infinite."
+        which = f"{count(int(bad.sum()), 'frame')} ({named(frames[bad].tolist())})"
+        text = f"{which} show nothing: all pixels are equal, or most are missing."
         yield Finding("bad_frames", "Frames could not be fitted", text, "Look at them in the movie.")
     poor = ~bad & (run.frames["share"].to_numpy() < HALF)
     if poor.any():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -15,11 +16,10 @@ from ..readers import open_source
 from ..readers.source import SourceMetadata
 from ..readers.times import has_stamps
 from ..settings.run import RunSettings
-from ..store import datasets, metadata
+from ..store import datasets, metadata, schema
 from ..store.movie import open_movie
 from ..store.results import open_results, part_in_words
 from ..store.run_folder import STORES, RunFolder
-from ..store.schema import Status
 
 
 def describe(path: str | Path, settings: RunSettings | None = None) -> dict[str, Any]:
@@ -76,7 +76,9 @@ def _along_frames(known: SourceMetadata) -> dict[str, str]:
 
 def _movie(path: Path) -> dict[str, Any]:
     movie = open_movie(path)
-    bad = movie.statistics()["frame_bad_pixels"].to_numpy() > 0
+    statistics = movie.statistics()
+    missing = statistics["frame_bad_pixels"].to_numpy() > 0
+    bad = schema.bad_frames(statistics, math.prod(movie.shape[1:]))
     return {
         "source": metadata.attributes(path).get("source"),
         **({"part of the source": words} if (words := part_in_words(movie.part)) else {}),
@@ -87,7 +89,8 @@ def _movie(path: Path) -> dict[str, Any]:
         "gain": movie.gain,
         "shards": len(movie.shards),
         "binned levels": list(movie.bins),
-        "frames with NaN or Inf": int(bad.sum()),
+        "frames with pixels that are missing": int(missing.sum()),
+        "bad frames": int(bad.sum()),
     }
 
 
@@ -131,7 +134,7 @@ def _columns(path: Path) -> dict[str, Any]:
         **_kinds(columns),
         "spacing, px": columns.attrs.get("spacing_px"),
         "window, px": columns.attrs.get("window_px"),
-        "outside the frame": int(((columns["status_ref"] & int(Status.OUTSIDE_FRAME)) > 0).sum()),
+        "outside the frame": int(((columns["status_ref"] & int(schema.Status.OUTSIDE_FRAME)) > 0).sum()),
         "edited by hand": metadata.attributes(path).get("edited", False),
     }
 

@@ -32,7 +32,8 @@ class Status(enum.IntFlag):
     """What speaks against a fit; 0 where nothing does.
 
     ``AT_BOUND`` is about position, amplitude and background. ``SHAPE_AT_BOUND`` is about the sigmas alone: the position
-    is then the best one for a column of that shape, and is accepted.
+    is then the best one for a column of that shape, and is accepted. ``INCOMPLETE`` is a window in which pixels are
+    missing: the fit is to those that are there, its errors say what is lost, and it is accepted.
     """
 
     OK = 0
@@ -42,6 +43,7 @@ class Status(enum.IntFlag):
     OUTSIDE_FRAME = 8
     BAD_FRAME = 16
     SHAPE_AT_BOUND = 32
+    INCOMPLETE = 64
 
 
 REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | Status.OUTSIDE_FRAME | Status.BAD_FRAME
@@ -168,7 +170,7 @@ STATISTICS = _declare(
         "Standard deviation of the frame's finite pixels",
         _NAN,
     ),
-    Variable("frame_bad_pixels", ("t",), "int64", "px", "Pixels that are NaN or infinite", 0),
+    Variable("frame_bad_pixels", ("t",), "int64", "px", "Pixels that hold no number or are left out", 0),
 )
 """Per-frame statistics in movie.zarr."""
 
@@ -226,6 +228,22 @@ def validate(dataset: xr.Dataset, variables: dict[str, Variable], where: str) ->
                 "Transpose or rename its dimensions",
             )
     return dataset
+
+
+def bad_frames(statistics: xr.Dataset, pixels: int) -> NDArray[np.bool_]:
+    """Return which frames show nothing, (frames,): all their pixels are equal, or more than half of them are missing.
+
+    Parameters
+    ----------
+    statistics
+        :data:`STATISTICS` of the frames, or of sums of frames, which have no ``frame_std``.
+    pixels
+        Of a frame.
+    """
+    bad: NDArray[np.bool_] = statistics["frame_bad_pixels"].to_numpy() > 0.5 * pixels
+    if "frame_std" in statistics:
+        bad = bad | ~(statistics["frame_std"].to_numpy() > 0)
+    return bad
 
 
 def drift_of(drift: xr.Dataset | None, n_frames: int) -> NDArray[np.float64]:

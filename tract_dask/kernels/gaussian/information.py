@@ -66,7 +66,7 @@ def column_bounds(
     y, x = rows[inside].astype(np.float64), across[inside].astype(np.float64)
     bounds = np.full((3, len(columns)), np.nan)
     for k, column in enumerate(columns):
-        expected, slopes, by_volume = _model(column, x, y, fixed_shape=fixed_shape)
+        expected, slopes, by_volume = model_slopes(column, x, y, fixed_shape=fixed_shape)
         if not (expected > 0).all():  # NaN is not
             continue
         scale = np.sqrt((slopes**2 / expected).sum(axis=1))
@@ -79,7 +79,7 @@ def column_bounds(
     return Bounds(*bounds)
 
 
-def _model(column: Floats, x: Floats, y: Floats, *, fixed_shape: bool) -> tuple[Floats, Floats, Floats]:
+def model_slopes(column: Floats, x: Floats, y: Floats, *, fixed_shape: bool) -> tuple[Floats, Floats, Floats]:
     """Return the pixels' expected counts (n,), their slopes (4 or 7, n), and those of the volume (4 or 7,).
 
     Slopes are by the free parameters: x, y, amplitude, background, and, where the shape is free, a, b, c.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -37,7 +38,7 @@ class Job:
     drift: Floats
     """(frames, 2) measured drift, (y, x), px, of all frames of the movie."""
     bad: NDArray[np.bool_]
-    """(frames,) frames with pixels that are NaN or infinite."""
+    """(frames,) frames that show nothing (:func:`schema.bad_frames`)."""
     window_px: int
     """Side of the windows."""
     vacuum: tuple[int, ...] | None
@@ -79,7 +80,7 @@ class Job:
         return cls(
             columns,
             columns["drift_measured"].to_numpy(),
-            movie.statistics()["frame_bad_pixels"].to_numpy() > 0,
+            schema.bad_frames(movie.statistics(), math.prod(movie.shape[1:])),
             window_px=about["window"],
             vacuum=tuple(about["vacuum"]) if about["vacuum"] else None,
             reference_blur_px=about["reference_blur_px"],
@@ -147,7 +148,7 @@ def prepare(
     return Job(
         columns,
         shift,
-        statistics["frame_bad_pixels"].to_numpy() > 0,
+        schema.bad_frames(statistics, math.prod(movie.shape[1:])),
         window_px=window_px,
         vacuum=box,
         reference_blur_px=columns.attrs.get("blur_sigma_px", settings.blur_sigma_px),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +21,8 @@ from ...store.schema import SIZES, Status
 from ...store.shards import Shard
 from .common_motion import common_motion, masked_median
 from .filters import filter_frame
+from .frame_fits import FrameFits
+from .incomplete import cut_raw, fill_near, fit_incomplete
 from .job import Job
 
 Values = dict[str, np.ndarray[Any, Any]]
@@ -31,58 +32,11 @@ _BATCH_BYTES = 4 << 20
 _NOISE_SIDE_PX = 256
 """Blurred with sigma 2 px, a square of this side has noise for 1300 independent values: its size is known to 2 %."""
 
+_LEAST_VACUUM = 0.5
+"""So much of the square has to be there."""
+
 _AT_BOUND = 1e-9
 """Share of the interval between its bounds within which a parameter is at its bound."""
-
-
-@dataclass(frozen=True)
-class FrameFits:
-    """What the windows of some frames give, (frames, columns, ...), at first in the coordinates of the windows.
-
-    Standard errors are NaN after a filter of whole frames: there is no theory of its noise. A fit is ``held`` where a
-    bound other than that of a sigma is active. Centroids are (y, x); strengths are those of the matched filters.
-    Residuals (rms) are NaN where there is vacuum, and so no need of them.
-    """
-
-    estimates: Floats
-    stderr: Floats
-    volume_stderr: Floats
-    r_squared: NDArray[np.float32]
-    n_iterations: NDArray[np.int16]
-    converged: NDArray[np.bool_]
-    at_bound: NDArray[np.bool_]
-    held: NDArray[np.bool_]
-    centroid: Floats
-    strength: Floats
-    residual: Floats
-
-    @classmethod
-    def joined(cls, parts: Sequence[FrameFits], shape: tuple[int, ...]) -> FrameFits:
-        """Return fits of successive windows, (windows, ...), as those of ``shape`` (frames, columns)."""
-        fields = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
-        return cls(**{name: values.reshape(*shape, *values.shape[1:]) for name, values in fields.items()})
-
-    def without(self, outside: NDArray[np.bool_], bad: NDArray[np.bool_]) -> FrameFits:
-        """Return the same with NaN for windows ``outside`` (frames, columns), and for centroids of ``bad`` frames."""
-        names = ("estimates", "stderr", "volume_stderr", "r_squared", "centroid", "strength", "residual")
-        blank: dict[str, Any] = {name: vars(self)[name].copy() for name in names}
-        for values in blank.values():
-            values[outside] = np.nan
-        blank["centroid"][bad] = np.nan
-        return replace(self, **blank, n_iterations=self.n_iterations * ~outside)
-
-    def moved(self, offset: NDArray[Any]) -> FrameFits:
-        """Return the same with positions moved by ``offset`` in (y, x), (frames, columns or 1, 2)."""
-        estimates = self.estimates.copy()
-        estimates[..., [Y, X]] += offset
-        return replace(self, estimates=estimates, centroid=self.centroid + offset)
-
-    def scaled(self, unit: float) -> FrameFits:
-        """Return the same with amplitudes, backgrounds and the errors of volumes times ``unit``, a power of two."""
-        factor = np.ones(7)
-        factor[[AMPLITUDE, BACKGROUND]] = unit
-        counts: dict[str, Any] = {name: vars(self)[name] * factor for name in ("estimates", "stderr")}
-        return replace(self, **counts, volume_stderr=self.volume_stderr * unit)
 
 
 class _Places(NamedTuple):
@@ -140,9 +94,16 @@ def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[_
             continue
         for number, pixels in enumerate(movie.read(start, stop), start):
             filters = job.settings.filters_frames
-            frame, lacking = (filter_frame(pixels, job.settings, gain), 1.0) if filters else (pixels, gain)
+            frame, lacking = (_filtered(pixels, job.settings, gain), 1.0) if filters else (pixels, gain)
             tiles = Tiles(frame[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
             yield _Places.of(movie, number, number + 1, job), tiles, lacking
+
+
+def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArray[np.float32]:
+    """Return a frame (y, x) after the filter of whole frames; what is missing in it is missing afterwards."""
+    if frame.dtype.kind != "f" or (there := np.isfinite(frame)).all() or not there.any():
+        return filter_frame(frame, settings, gain)
+    return np.where(there, filter_frame(fill_near(frame), settings, gain), np.float32(np.nan))
 
 
 def _measure_frames(places: _Places, tiles: Tiles, gain: float, job: Job) -> Values:
@@ -183,11 +144,11 @@ def _vacuum_noise(
     if places.vacuum is None:
         noise = _damping(job.settings) * masked_median(residual, np.isfinite(residual))
     else:
-        squares = _squares(tiles, places.vacuum, blur, gain)
+        squares, share = _squares(tiles, places.vacuum, blur, gain)
         with np.errstate(invalid="ignore"):  # pixels of bad frames
-            noise = np.asarray(squares.reshape(len(squares), -1).std(axis=1), dtype=np.float64)
+            noise = np.asarray(squares.reshape(len(squares), -1).std(axis=1), dtype=np.float64) / np.sqrt(share)
         if job.settings.window_blur_px != blur:
-            squares = _squares(tiles, places.vacuum, job.settings.window_blur_px, gain)
+            squares, _ = _squares(tiles, places.vacuum, job.settings.window_blur_px, gain)
         empty = _empty_strengths(squares, places.start, job)
     with np.errstate(divide="ignore", invalid="ignore"):  # vacuum without noise
         return noise, _white_noise_left(blur) / noise[:, None], empty
@@ -195,12 +156,13 @@ def _vacuum_noise(
 
 def _status(fits: FrameFits, places: _Places, weakest: Floats) -> NDArray[np.uint8]:
     """Return what speaks against each fit, (frames, columns); ``weakest`` (frames) is the smallest good amplitude."""
-    inside = ~places.outside
+    inside, amplitude = ~places.outside, np.abs(fits.estimates[..., AMPLITUDE])
     flags = {
-        Status.BELOW_NOISE: ~(np.abs(fits.estimates[..., AMPLITUDE]) > weakest[:, None]) & inside,
+        Status.BELOW_NOISE: ~(amplitude > weakest[:, None]) & inside & ~(fits.incomplete & np.isnan(amplitude)),
         Status.NOT_CONVERGED: ~fits.converged & inside,
         Status.AT_BOUND: fits.held & inside,
         Status.SHAPE_AT_BOUND: fits.at_bound & ~fits.held & inside,
+        Status.INCOMPLETE: fits.incomplete & inside & ~places.bad[:, None],
         Status.OUTSIDE_FRAME: places.outside,
         Status.BAD_FRAME: places.bad[:, None],
     }
@@ -222,16 +184,55 @@ def _fit(places: _Places, tiles: Tiles, gain: float, job: Job) -> FrameFits:
         part = slice(start, start + batch)
         y, x = places.corner[part, :, 0], places.corner[part, :, 1]
         windows = cut_windows(tiles, y, x, job.window_px, job.settings.window_blur_px, gain, start)
-        parts.append(_fit_windows(windows.reshape(-1, *windows.shape[2:]), [values[part] for values in bounds], job))
+        limits = [values[part].reshape(-1, 7) for values in bounds]
+        fits = _fit_windows(windows.reshape(-1, *windows.shape[2:]), limits, np.arange(y.size) % n_columns, job)
+        sound = ~(places.outside[part] | places.bad[part, None])
+        if (missing := ~np.isfinite(fits.strength) & sound.ravel()).any():
+            _fit_again(fits, np.flatnonzero(missing), (tiles, start, places.corner[part], gain), limits, job)
+        parts.append(fits)
     return FrameFits.joined(parts, places.outside.shape)
 
 
-def _fit_windows(windows: NDArray[np.float32], bounds: Sequence[Floats], job: Job) -> FrameFits:
-    """Return what windows (n, h, w) give, with start values and bounds (frames, columns, 7) in their coordinates."""
+def _fit_again(
+    fits: FrameFits,
+    which: NDArray[np.int64],
+    pixels: tuple[Tiles, int, NDArray[np.int64], float],
+    bounds: Sequence[Floats],
+    job: Job,
+) -> None:
+    """Fit the windows of these numbers, in which pixels are missing, to those that are there; replace their fits.
+
+    Parameters
+    ----------
+    pixels
+        Tiles, number of the first frame, the corners (frames, columns, 2) of the windows from there on, and the gain.
+    """
+    tiles, first, corners, gain = pixels
+    halo = gaussian_kernel(job.settings.window_blur_px).size // 2
+    frame, column = np.divmod(which, corners.shape[1])
+    raw = cut_raw(tiles, first + frame, corners[frame, column] - halo, job.window_px + 2 * halo, gain)
+
+    def fit(windows: NDArray[np.float32], numbers: NDArray[np.int64]) -> FrameFits:
+        return _fit_windows(windows, [values[which[numbers]] for values in bounds], column[numbers], job)
+
+    found, missing, lost = fit_incomplete(raw, job.settings, fit)
+    for name, values in vars(found).items():
+        vars(fits)[name][which] = values
+    fits.incomplete[which] = missing
+    for flags in (fits.converged, fits.held, fits.at_bound):
+        flags[which[lost]] = False
+    for values in (fits.estimates, fits.centroid, fits.strength):
+        values[which[lost]] = np.nan
+
+
+def _fit_windows(
+    windows: NDArray[np.float32], bounds: Sequence[Floats], which: NDArray[np.int64], job: Job
+) -> FrameFits:
+    """Return what windows (n, h, w) of columns ``which`` give, with start and bounds (n, 7) in their coordinates."""
     settings, (start, lower, upper) = job.settings, bounds
     fits = fit_gaussians(
         windows,
-        *(values.reshape(-1, 7) for values in bounds),
+        *bounds,
         estimator=settings.estimator,
         fixed_shape=settings.shape == "fixed",
         blur_sigma_px=settings.window_blur_px,
@@ -244,7 +245,7 @@ def _fit_windows(windows: NDArray[np.float32], bounds: Sequence[Floats], job: Jo
         fits.stderr[:], fits.volume_stderr[:] = np.nan, np.nan
     held, residual = np.zeros(len(windows), np.bool_), np.full(len(windows), np.nan)
     for k in (AMPLITUDE, X, Y, BACKGROUND):
-        low, high, value = lower[..., k].ravel(), upper[..., k].ravel(), fits.estimates[:, k]
+        low, high, value = lower[:, k], upper[:, k], fits.estimates[:, k]
         held |= np.minimum(value - low, high - value) < _AT_BOUND * (high - low)
     if job.vacuum is None:
         with np.errstate(invalid="ignore"):  # windows of bad frames
@@ -259,23 +260,22 @@ def _fit_windows(windows: NDArray[np.float32], bounds: Sequence[Floats], job: Jo
         fits.converged,
         fits.at_bound,
         held,
-        _centroids(windows, start, job),
-        strengths(windows, job.filters, np.arange(len(windows)) % start.shape[1]).astype(np.float64),
+        _centroids(windows, start, which, job),
+        strengths(windows, job.filters, which).astype(np.float64),
         residual,
+        np.zeros(len(windows), np.bool_),
     )
 
 
-def _centroids(windows: NDArray[np.float32], start: Floats, job: Job) -> Floats:
+def _centroids(windows: NDArray[np.float32], start: Floats, which: NDArray[np.int64], job: Job) -> Floats:
     """Return the centroids of windows (n, h, w), (n, 2) rows of (y, x), in a mask that begins where the fit does.
 
     Its radius is that with the least noise for a Gaussian with the column's width.
     """
     sigma = np.sqrt(job.reference[:, SIGMA_A] * job.reference[:, SIGMA_B])
     best = np.full(len(sigma), job.settings.mask_radius_px) if job.settings.mask_radius_px else BEST_RADIUS * sigma
-    radius = np.broadcast_to(np.maximum(best, SMALLEST_RADIUS_PX), start.shape[:2]).ravel()
-    dark = np.broadcast_to(job.reference[:, AMPLITUDE] < 0, start.shape[:2]).ravel()
-    places = start[..., [X, Y]].reshape(-1, 2)
-    return window_centroids(windows, places, radius, _reach(job), dark=dark).places[:, ::-1]
+    radius, dark = np.maximum(best, SMALLEST_RADIUS_PX)[which], (job.reference[:, AMPLITUDE] < 0)[which]
+    return window_centroids(windows, start[:, [X, Y]], radius, _reach(job), dark=dark).places[:, ::-1]
 
 
 def _disc(size: int) -> NDArray[np.bool_]:
@@ -340,9 +340,23 @@ def _vacuum(job: Job, drift: Floats, shape: NDArray[np.int64]) -> NDArray[np.int
     return np.column_stack([corner, np.full(len(corner), side)])
 
 
-def _squares(tiles: Tiles, vacuum: NDArray[np.int64], blur_sigma_px: float, gain: float) -> NDArray[np.float32]:
-    """Return the squares of vacuum of some frames, (frames, side, side), after that blur."""
-    return cut_windows(tiles, vacuum[:, :1], vacuum[:, 1:2], int(vacuum[0, 2]), blur_sigma_px, gain)[:, 0]
+def _squares(
+    tiles: Tiles, vacuum: NDArray[np.int64], blur_sigma_px: float, gain: float
+) -> tuple[NDArray[np.float32], Floats]:
+    """Return the squares of vacuum of some frames, (frames, side, side), after that blur, and what is there of each.
+
+    Pixels that are missing are filled with the mean of what is near, unless most of the square is missing.
+    """
+    side = int(vacuum[0, 2])
+    squares = cut_windows(tiles, vacuum[:, :1], vacuum[:, 1:2], side, blur_sigma_px, gain)[:, 0]
+    halo, share = gaussian_kernel(blur_sigma_px).size // 2, np.ones(len(squares))
+    for k in np.flatnonzero(~np.isfinite(squares.sum(axis=(1, 2)))):
+        raw = cut_raw(tiles, np.array([k]), vacuum[k : k + 1, :2] - halo, side + 2 * halo, gain)[0]
+        there = np.isfinite(raw).mean()
+        if there > _LEAST_VACUUM:
+            corner = np.array([[halo]])
+            share[k], squares[k] = there, cut_windows(fill_near(raw)[None], corner, corner, side, blur_sigma_px)[0, 0]
+    return squares, share
 
 
 def _empty_strengths(squares: NDArray[np.float32], start: int, job: Job) -> NDArray[np.float32]:

@@ -1,0 +1,139 @@
+"""Windows that miss pixels, fitted to those that are there.
+
+A window without data at some pixels is filled there by its own fit, fitted again, and so on until the place rests:
+expectation and maximisation, whose end is the fit to the pixels that are there. Filled pixels bring no information, so
+the errors are those of the filled window times what is lost with the pixels (:func:`.missing.widening`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...kernels.gaussian.missing import widening
+from ...kernels.gaussian.model import blurred, evaluate
+from ...kernels.gaussian.parameters import AMPLITUDE, X, Y
+from ...kernels.windows import Tiles, blur, cut_windows, gaussian_kernel
+from ...settings.run import FitSettings
+from .frame_fits import FrameFits
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LARGEST_GROWTH = 3.0
+"""A window is fitted while the error of its column's place grows by no more than this."""
+
+_RESTS_PX = 2e-3
+_MOST_ROUNDS = 40
+_REACH_PX = 3.0
+"""Sigma of the mean of what is near, that a pixel is first filled with."""
+
+
+def cut_raw(
+    tiles: Tiles, frame: NDArray[np.int64], corner: NDArray[np.int64], side: int, gain: float
+) -> NDArray[np.float32]:
+    """Return square parts (n, side, side) of frames, times ``gain``; the edge pixel goes on beyond the frame.
+
+    Parameters
+    ----------
+    frame, corner
+        (n,) number of the frame among the tiles, and (n, 2) first row and column.
+    """
+    height, width = tiles.pixels.shape[2:]
+    along = np.arange(side)
+    y = np.clip(corner[:, :1] + along, 0, tiles.shape[0] - 1)[:, :, None]
+    x = np.clip(corner[:, 1:] + along, 0, tiles.shape[1] - 1)[:, None, :]
+    pixels = tiles.pixels[tiles.place[y // height, x // width], frame[:, None, None], y % height, x % width]
+    counts: NDArray[np.float32] = np.multiply(pixels, np.float32(gain), dtype=np.float32)
+    return counts
+
+
+def fill_near(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Return an image (y, x) whose pixels that are NaN or infinite are the mean of what is near them.
+
+    Examples
+    --------
+    >>> fill_near(np.array([[2.0, np.nan, 2.0]])).tolist()
+    [[2.0, 2.0, 2.0]]
+    """
+    there = np.isfinite(image)
+    filled: NDArray[np.float32] = np.where(there, image, 0).astype(np.float32)
+    if there.all() or not there.any():
+        return filled
+    level = np.float32(filled[there].mean(dtype=np.float64))
+    share = blur(there.astype(np.float32), _REACH_PX)
+    near = blur(np.where(there, filled - level, 0).astype(np.float32), _REACH_PX)
+    np.copyto(filled, level + near / np.maximum(share, np.float32(1e-3)), where=~there)
+    return filled
+
+
+def fit_incomplete(
+    raw: NDArray[np.float32],
+    settings: FitSettings,
+    fit: Callable[[NDArray[np.float32], NDArray[np.int64]], FrameFits],
+) -> tuple[FrameFits, Bools, Bools]:
+    """Fit windows to the pixels that are there.
+
+    Parameters
+    ----------
+    raw
+        (n, side, side) pixels before the blur, with the margin that the blur reaches; NaN or infinite where missing.
+    fit
+        Fits blurred windows (m, h, w), which are those of these numbers (m,).
+
+    Returns
+    -------
+    fits, missing, lost
+        The fits, with errors as they are with the pixels that are there; (n,) whether a pixel of the round window is
+        missing, and whether so many are that the column's place is not known.
+    """
+    margin = gaussian_kernel(settings.window_blur_px).size // 2
+    size = raw.shape[-1] - 2 * margin
+    there = np.isfinite(raw)
+    inner = there[:, margin : margin + size, margin : margin + size]
+    away = np.hypot(*np.indices(raw.shape[1:]) - raw.shape[1] // 2)
+    own = ~there & (away <= size / 2 + margin)
+    filled = np.stack([fill_near(image) for image in raw])
+    moving = np.arange(len(raw))
+    estimates = np.array(fit(_blurred(filled, margin, size, settings), moving).estimates)
+    for _ in range(_MOST_ROUNDS):
+        model = _unblurred(estimates[moving], settings, margin, raw.shape[-1])
+        filled[moving] = np.where(own[moving], model, filled[moving])
+        now = fit(_blurred(filled[moving], margin, size, settings), moving).estimates
+        step = np.abs(now - estimates[moving])[:, [X, Y]].max(axis=1)
+        estimates[moving] = now
+        moving = moving[step > _RESTS_PX]
+        if not moving.size:
+            break
+    fits = fit(_blurred(filled, margin, size, settings), np.arange(len(raw)))
+    disc = np.hypot(*np.indices((size, size)) - size // 2) <= size / 2
+    missing = np.invert(inner[:, disc].all(axis=1))
+    factors, volume = widening(
+        fits.estimates,
+        inner,
+        fixed_shape=settings.shape == "fixed",
+        counting=settings.counting,
+        likelihood=settings.estimator == "poisson",
+    )
+    lost: Bools = missing & (~(factors[:, [X, Y]].max(axis=1) <= LARGEST_GROWTH) | np.isin(np.arange(len(raw)), moving))
+    grown = np.where(lost, np.nan, 1.0)[:, None] * factors
+    fits.stderr[:] *= grown
+    fits.volume_stderr[:] *= np.where(lost, np.nan, volume)
+    fits.strength[:] /= grown[:, AMPLITUDE]
+    fits.residual[:] *= np.sqrt(disc.sum() / np.maximum(inner[:, disc].sum(axis=1), 1))
+    return fits, missing, lost
+
+
+def _blurred(filled: NDArray[np.float32], margin: int, size: int, settings: FitSettings) -> NDArray[np.float32]:
+    corner = np.full((len(filled), 1), margin)
+    return cut_windows(filled, corner, corner, size, settings.window_blur_px)[:, 0]
+
+
+def _unblurred(estimates: Floats, settings: FitSettings, margin: int, side: int) -> NDArray[np.float32]:
+    """Return what fits expect before the blur, (n, side, side)."""
+    raw = blurred(estimates, -(settings.window_blur_px**2))
+    raw[:, [X, Y]] += margin
+    return evaluate(raw, np.arange(side), np.arange(side)[:, None]).astype(np.float32)
