@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 from tract_dask.kernels.gaussian.fit import SMALLEST_SIGMA_PX, Outcome, fit_gaussians
-from tract_dask.kernels.gaussian.model import canonical, evaluate, gaussian_image
+from tract_dask.kernels.gaussian.model import blurred, canonical, evaluate, gaussian_image
 
 NOISE_FREE_PX = 1e-4
 FROM_SCIPY_POSITION_PX = 1e-3  # 99 % of fits
@@ -19,6 +19,7 @@ PULL_WIDTH_RAW = 0.06  # the same, where the windows are not blurred
 WEAK_FOUND = 0.97  # of columns with a peak of 5 on 20 in 25 x 25 px, within 3 px of the truth
 WEAK_FOUND_WIDE = 0.985  # the same in 51 x 51 px
 WEAK_CONVERGED = 0.995
+CLEAR_LOST = 0.005  # of wide columns far above the noise, where float32 sees no further fall
 
 SIZE, MIDDLE = 25, 12
 WIDE_LOWER = (0.0, 6.0, 6.0, 1.0, 1.0, 0.0, 0.0)
@@ -188,6 +189,24 @@ def test_weak_columns_are_found(estimator, size, sigma, found):
     near = (np.abs(fits.estimates - truth)[:, 1:3] < 3).all(axis=1)
     assert (near & fits.converged).mean() >= found
     assert fits.converged.mean() >= WEAK_CONVERGED
+
+
+@pytest.mark.parametrize(("height", "level"), [(300, 300), (-500, 1000)])
+@pytest.mark.parametrize("fixed", [True, False])
+def test_no_fit_is_lost_where_rounding_hides_the_last_falls(height, level, fixed):
+    """A column as wide as its window, with a neighbour: four in a hundred ended without a verdict before."""
+    halo, size, rng = 9, 21, np.random.default_rng(2)
+    truth = np.tile([height, 0, 0, 6.6, 5.4, 0.4, level], (600, 1))
+    truth[:, 1:3] = size // 2 + rng.uniform(-0.5, 0.5, (600, 2))
+    neighbour = truth + np.array([0, size, 0, 0, 0, 0, 0]) - np.array([0.7 * height, 0, 0, 0, 0, 0, level])
+    moved = np.array([0, halo, halo, 0, 0, 0, 0])
+    images = sum(gaussian_image(part + moved, (size + 2 * halo,) * 2) for part in (truth, neighbour))
+    windows = gaussian_filter(rng.poisson(images).astype(float), (0, 2, 2))[:, halo:-halo, halo:-halo]
+    start = blurred(truth, 2.0**2)
+    lower, upper = start - np.array([0, 5, 5, 1, 1, 0, 2 * abs(height)]), start + np.array([0, 5, 5, 2, 2, 0, 5000])
+    lower[:, 0], upper[:, 0] = np.sort([np.zeros(600), 5 * start[:, 0]], axis=0)
+    fits = fit_gaussians(windows, start, lower, upper, fixed_shape=fixed, blur_sigma_px=2.0, radius_px=size / 2)
+    assert (~fits.converged).mean() <= CLEAR_LOST
 
 
 def test_maximum_likelihood_of_a_dark_column_is_at_the_bound():

@@ -394,7 +394,8 @@ def fit_windows(images: Array, problem: Problem, options: Options, noise: Noise)
     for likelihood in (None, True) if options.poisson else (None,):
         last = bool(likelihood) == options.poisson
         tolerance = options.tolerance_px if last else max(_LOOSE_PX, options.tolerance_px)
-        limits = np.float32(tolerance), np.float32((2 if likelihood else 1) * options.max_iterations)
+        share = 1 / (frame.sides[2] * noise.blur_power)
+        limits = np.float32(tolerance), np.float32((2 if likelihood else 1) * options.max_iterations), np.float32(share)
         _iterate(pixels, frame, table, limits, likelihood)
     errors = np.empty((n, N_ERRORS), np.float32)
     _find_errors(frame, table, None if options.poisson else noise, errors)

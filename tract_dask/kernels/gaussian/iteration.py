@@ -98,6 +98,8 @@ FIRST_DAMPING = 1e-2
 _UNDAMPED = 1e-2  # below this a step is a Gauss-Newton step for all that matters
 _LARGEST_DAMPING = 1e8
 _LEFT = 0.1  # of the tolerance, what may be left to go after a step whose length is not below it
+_SETTLED = 1e-4  # of a raw pixel's variance: what the residual's sum of squares may still fall by
+_STALLED = 1e-2  # the same after a step that float32 saw as no fall
 _ROUNDING = 1e-5  # relative noise of a sum of squares in float32
 _FLOOR = 1e-6  # the same, relative to the pixels' own sum of squares
 _LARGEST = 3e38
@@ -305,13 +307,16 @@ def _slope(system: Rows, step: list[Vector]) -> Vector:
 
 
 @traced(types.int64)
-def _conclude(state: Rows, system: Rows, tolerance: Vector, most: Vector, likelihood: Any) -> Any:
+def _conclude(state: Rows, system: Rows, limits: Any, likelihood: Any) -> Any:
     """Write the next trial of each fit; return how many are still running.
 
     A fit has converged when what is left to go after a step is below the tolerance. Steps that shrink by a factor r
     each leave r / (1 - r) times the last one; here they shrink faster and faster. That is so while the same bounds are
-    active.
+    active. It has converged, too, when the fall of the residual that the step promises (the Newton decrement, which is
+    the squared distance from the minimum in units of the noise) is far below the noise: at high signal float32 cannot
+    tell the last falls from its own rounding, and rejects what is right.
     """
+    tolerance, most, share = limits
     point, damping, steps = state + POINT, state[DAMPING], state[STEPS]
     running, solved = state[OUTCOME].equals(RUNNING), system[SOLVED] > 0
     step = read(system, STEP, 7)
@@ -320,7 +325,9 @@ def _conclude(state: Rows, system: Rows, tolerance: Vector, most: Vector, likeli
     shrinking = (
         (length < 0.5 * before) & (length * length < _LEFT * tolerance * (before - length)) & held.equals(state[HELD])
     )
-    near = (length < tolerance) | shrinking
+    slope, noise = _slope(system, step), state[SUMS + MERIT] * share
+    settled = -slope < select(before > 0, noise * _SETTLED, noise * _STALLED)  # a length of 0: the last was rejected
+    near = (length < tolerance) | shrinking | settled
     small = near & (damping <= _UNDAMPED) & solved
     known = (system[HESSIAN + XX] > 0) & (system[HESSIAN + YY] > 0)
     stopped = (damping > _LARGEST_DAMPING) | (steps >= most)
@@ -333,7 +340,7 @@ def _conclude(state: Rows, system: Rows, tolerance: Vector, most: Vector, likeli
     state[HELD] = select(running, held, state[HELD])
     arrived = running & outcome.equals(CONVERGED)
     for row in (SUMS + MERIT, SUMS + RESIDUAL) if likelihood is None else ():
-        state[row] = select(arrived, larger(state[row] + _slope(system, step), 0), state[row])
+        state[row] = select(arrived, larger(state[row] + slope, 0), state[row])
     for row in range(N_PARAMETERS):
         state[TRIAL + row] = trial[row]
         state[POINT + row] = select(arrived, trial[row], state[POINT + row])
@@ -370,10 +377,10 @@ def run(images: Array, grid: Grid, rooms: Any, table: Any, queue: Array, likelih
     """Fit the windows whose rows of the table (n, N_STATE) are in the queue, to the end.
 
     ``images`` are all windows' pixels in a row. ``rooms`` are rows for the block, a state, sums, and equations, and two
-    (LANES,) int64. ``limits`` are the tolerance and the number of steps.
+    (LANES,) int64. ``limits`` are the tolerance, the number of steps, and the share of the residual's sum of
+    squares that is a raw pixel's variance.
     """
     block, state, sums, part, system, fits, starts = rooms
-    tolerance, most = limits
     left = queue.size
     while left > 0:
         again = 0
@@ -395,7 +402,7 @@ def run(images: Array, grid: Grid, rooms: Any, table: Any, queue: Array, likelih
                         break
                 while _solve(state, system) > 0:
                     pass
-                n_running = _conclude(state, system, tolerance, most, likelihood)
+                n_running = _conclude(state, system, limits, likelihood)
             _scatter(state, fits, lanes, starts, part, table)
             for lane in range(lanes):
                 if number(state, OUTCOME * LANES + lane) == RUNNING:
