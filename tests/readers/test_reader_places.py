@@ -6,7 +6,8 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -254,3 +255,60 @@ def test_the_systems_own_error_stays_the_cause(number: int, tmp_path: Path, monk
             attempt()
         assert isinstance(caught.value.__cause__, OSError)
         assert caught.value.__cause__.errno == number
+
+
+def in_time(work: Callable[[], object], seconds: float = 20) -> object:
+    """Return what may not wait for anything, its error included; the rest of the tests goes on where it does."""
+    found: list[object] = []
+
+    def run() -> None:
+        try:
+            found.append(work())
+        except Exception as error:  # noqa: BLE001 - the test looks at it
+            found.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    assert found, "it waits forever"
+    return found[0]
+
+
+@KINDS
+def test_a_pipe_in_place_of_a_movie_that_is_open(suffix: str, tmp_path: Path) -> None:
+    path = write(tmp_path / f"movie{suffix}")
+    source = open_source(path, DECLARED)
+    for file in source.files:
+        file.unlink()
+        os.mkfifo(file)
+    said = in_time(lambda: source.read(0, 1))
+    assert isinstance(said, SourceError)
+    assert "a pipe" in str(said)
+
+
+BESIDE_MOVIES = (
+    *(".mdoc", "_info.txt", ".hdr", ".emi", ".dark.mrc", ".gain.mrc", ".metadata", ".xml", ".Config.Metadata.xml"),
+    *("_1.ser", "_001.tvips", "_master.h5", "_data_000001.h5", ".gain"),
+)
+
+
+@KINDS
+def test_pipes_beside_a_movie(suffix: str, tmp_path: Path) -> None:
+    """A pipe may have any name that a file beside a movie can have; it holds nothing that a movie lacks."""
+    path = write(tmp_path / f"movie_000{suffix}")
+    there = {os.path.realpath(path)}
+    for stem in ("movie_000", "movie", path.name):
+        for end in BESIDE_MOVIES:
+            place = tmp_path / f"{stem}{end}"
+            if os.path.realpath(place) not in there and not (suffix == ".tvips" and end == "_001.tvips"):
+                os.mkfifo(place)
+    assert in_time(lambda: open_source(path, DECLARED).shape) == (4, 20, 24)
+
+
+def test_a_pipe_as_a_later_part(tmp_path: Path) -> None:
+    """A pipe at the end is no empty file, which a camera may leave there."""
+    write_tvips(tmp_path / "m_000.tvips", FRAMES, per_file=2)
+    first, second = sorted(tmp_path.iterdir())
+    second.unlink()
+    os.mkfifo(second)
+    fails(first, second.name, "a pipe")

@@ -16,7 +16,7 @@ from serviced import URL, make_app, make_root
 from starving import reserved
 
 from tract_dask.errors import SettingsError, SourceError
-from tract_dask.readers import Reader
+from tract_dask.readers import READERS, Reader
 from tract_dask.service.api.answers import whole
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.jobs import public
@@ -39,10 +39,8 @@ def deadly(tmp_path_factory):
         (root / f"bad.{kind}").write_bytes(b"x")
     app = make_app(root)
     patch = pytest.MonkeyPatch()
-    for module in (*sys.modules.values(),):
-        if getattr(module, "__name__", "").startswith("tract_dask") and hasattr(module, "READERS"):
-            made_up = dict.fromkeys((".crash", ".hang", ".starve"), Reader("made up", (), open))
-            patch.setattr(module, "READERS", module.READERS | made_up)
+    for suffix in (".crash", ".hang", ".starve"):
+        patch.setitem(READERS, suffix, Reader("made up", (suffix,), open))
     app.state.services.pool = ProcessPool(2, memory=512 << 20, imported=("starving",))
     yield TestClient(app, base_url=URL, raise_server_exceptions=False)
     app.state.services.pool.close()

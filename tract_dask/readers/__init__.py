@@ -155,8 +155,7 @@ def is_movie_folder(place: Path) -> bool:
 
 
 def _reader_of_folder(place: Path) -> Reader | None:
-    readers = dict.fromkeys(READERS.values()) if place.is_dir() else {}
-    return next((reader for reader in readers if reader.is_movie(place)), None)
+    return READERS.of_folder(place) if place.is_dir() else None
 
 
 def files_named_now(source: FrameSource) -> tuple[tuple[Path, ...], tuple[Path, ...]] | None:

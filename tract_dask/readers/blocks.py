@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SourceError
-from .checks import Frames, checked_dtype, checked_shape, truncated, widened
+from .checks import Frames, checked_dtype, checked_shape, open_binary, truncated, widened
 from .source import NOTHING_KNOWN, FilledSource, SourceMetadata
 
 
@@ -77,7 +77,7 @@ class BlockSource(FilledSource):
                 while len(rest):
                     number = bisect_right(self.firsts, at) - 1
                     if number not in opened:
-                        opened[number] = stack.enter_context(self.files[number].open("rb", buffering=0))
+                        opened[number] = stack.enter_context(open_binary(self.files[number], 0))
                     until = self.firsts[number + 1] if number + 1 < len(self.firsts) else at + len(rest)
                     part = rest[: until - at]
                     fill_from(opened[number], at - self.firsts[number], part, self.files[number])
@@ -146,7 +146,7 @@ def fill_from(file: Any, offset: int, frames: Frames, path: Path) -> None:
 def read_records(path: Path, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return small records of one type, such as the headers of frames, that lie at ``offsets`` in a file."""
     found = np.empty(len(offsets), dtype)
-    with path.open("rb", buffering=0) as file:
+    with open_binary(path, 0) as file:
         for k, offset in enumerate(offsets.tolist()):
             fill_from(file, offset, found[k : k + 1], path)
     return found

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,9 +137,16 @@ def lies_there(file: Path, permit: Permit | None) -> bool:
     return file.is_file() and file.stat().st_size > 0
 
 
+def _is_empty(file: Path, permit: Permit | None) -> bool:
+    """Tell whether a file has no bytes; a link is asked for before it is followed, as in :func:`lies_there`."""
+    if permit is not None and file.is_symlink():
+        permit(Path(os.path.realpath(file)))
+    return file.is_file() and file.stat().st_size == 0
+
+
 def without_empty_end(parts: Sequence[Path], permit: Permit | None) -> Sequence[Path]:
     """Return the files of a movie without empty ones at the end: a camera may have opened a file for no more frames."""
-    last = max(k for k, part in enumerate(parts) if not k or lies_there(part, permit)) if parts else -1
+    last = max((k for k, part in enumerate(parts) if not k or not _is_empty(part, permit)), default=-1)
     return parts[: last + 1]
 
 
@@ -183,6 +190,27 @@ _KINDS: dict[Callable[[int], bool], str] = {
     stat.S_ISCHR: "a device",
     stat.S_ISBLK: "a device",
 }
+
+
+def open_binary(path: Path, buffering: int = -1) -> BinaryIO:
+    """Open a file to be read; at once, also where something else has taken its place since it was looked at.
+
+    Raises
+    ------
+    SourceError
+        Where it is a pipe, a socket or a device: to wait for one could take forever.
+    OSError
+        As the system says.
+    """
+    file = open(path, "rb", buffering, opener=_without_waiting)  # noqa: SIM115 - pathlib has no opener
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        checked_file(path)
+    return file
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 @contextmanager

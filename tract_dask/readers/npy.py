@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import open_block
-from .checks import Frames, Permit, checked_dtype, checked_shape, truncated, unaccounted, widened
+from .checks import Frames, Permit, checked_dtype, checked_shape, open_binary, truncated, unaccounted, widened
 from .source import Source, SourceMetadata
 
 _HEADER_BYTES = 10_000
@@ -42,8 +42,9 @@ class FortranSource(Source):
         size = self.files[0].stat().st_size
         if size < self.n_bytes:  # to touch a map beyond its file would end the process
             raise truncated(self.path, "before the frames that it held when it was opened", self.n_bytes, size)
-        frames = np.memmap(self.files[0], self.stored, "r", self.offset, self.axes, "F").reshape(self.shape)[start:stop]
-        return widened(np.array(frames, order="C"), self.dtype)
+        with open_binary(self.files[0]) as file:
+            stack = np.memmap(file, self.stored, "r", self.offset, self.axes, "F").reshape(self.shape)
+        return widened(np.array(stack[start:stop], order="C"), self.dtype)
 
 
 def open_npy(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> Source:
@@ -86,7 +87,7 @@ def open_npy(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
 
 def _header(path: Path) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Return shape, whether the order is Fortran's, pixel type, and where the pixels begin."""
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         first = np.lib.format.read_magic(file) == (1, 0)
         length = struct.unpack("<H" if first else "<I", file.read(2 if first else 4))[0]
         if length > _HEADER_BYTES:

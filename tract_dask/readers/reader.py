@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -55,8 +55,3 @@ class Reader:
     inside: str = ""
     is_movie: Callable[[Path], bool] = _never
     parts: Callable[[Sequence[Path]], set[Path]] = _none
-
-
-def by_suffix(readers: Iterable[Reader]) -> dict[str, Reader]:
-    """Return readers by the suffixes of their files; an earlier one keeps a suffix that a later one has, too."""
-    return {suffix: reader for reader in reversed(tuple(readers)) for suffix in reader.suffixes}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from importlib.metadata import entry_points
-
 from . import video
 from .dm import in_situ as gatan
 from .hdf5 import open_hdf5
@@ -12,7 +9,8 @@ from .hdf5.dectris import is_part
 from .merlin import headers_of_mibs, open_merlin
 from .mrc import open_mrc
 from .npy import open_npy
-from .reader import Reader, by_suffix, one_by_one
+from .others import Readers
+from .reader import Reader, one_by_one
 from .seq import belongs_to_seq, open_seq
 from .tia import is_emi, open_tia
 from .tiff import open_tiff
@@ -47,21 +45,5 @@ BUILT_IN = (
 """The formats that this package reads. A new format is a line here."""
 
 
-def _of_others() -> list[Reader]:
-    """Return the readers of other packages; one that cannot be loaded is a warning, and its format stays unknown."""
-    found = []
-    for entry in entry_points(group="tract_dask.readers"):
-        try:
-            reader = entry.load()
-        except Exception as error:  # noqa: BLE001 - whatever another package does when it is imported
-            warnings.warn(f"the reader {entry.name} ({entry.value}) cannot be loaded: {error}", stacklevel=2)
-            continue
-        if isinstance(reader, Reader):
-            found.append(reader)
-        else:
-            warnings.warn(f"the entry point {entry.name} ({entry.value}) does not name a Reader", stacklevel=2)
-    return found
-
-
-READERS: dict[str, Reader] = by_suffix((*BUILT_IN, *_of_others()))
+READERS = Readers(BUILT_IN)
 """The reader of each suffix."""

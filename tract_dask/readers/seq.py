@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .checks import Permit, checked_shape, is_named, truncated
+from .checks import Permit, checked_shape, is_named, open_binary, truncated
 from .source import SourceMetadata
 from .times import timed_ticks
 
@@ -105,7 +105,7 @@ class _Header:
 
 
 def _header(path: Path) -> _Header:
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         data = file.read(_HEADER_BYTES)
     if len(data) < _HEADER_BYTES:
         raise truncated(str(path), "in its header", _HEADER_BYTES, len(data))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import MissingSourceError, SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .checks import Permit, checked_file, checked_shape, truncated, untested, without_empty_end
+from .checks import Permit, checked_file, checked_shape, open_binary, truncated, untested, without_empty_end
 from .source import FrameValues, SourceMetadata
 from .times import timed_ticks
 from .units import to_pm
@@ -102,7 +102,7 @@ class _Series:
 
 
 def _series(path: Path) -> _Series:
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         data = file.read(_SERIES_BYTES)
     record = np.frombuffer(data.ljust(_SERIES_BYTES, b"\0"), _SERIES, 1)[0]
     header = dict(zip(_SERIES.names or (), record.tolist(), strict=True))

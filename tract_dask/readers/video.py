@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, SourceError
 from ..settings.run import SourceSettings
-from .checks import Frames, Permit, checked_claim, checked_shape
+from .checks import Frames, Permit, checked_claim, checked_file, checked_shape
 from .source import Source, SourceMetadata
 from .times import timed
 
@@ -64,6 +64,7 @@ class VideoSource(Source):
     def _decoded(self, start: int, stop: int) -> Iterator[tuple[int, Any]]:
         """Yield the frames from ``start`` to ``stop`` (not included) with their numbers."""
         av = _package(self.path)
+        checked_file(self.files[0])
         with av.open(str(self.files[0]), metadata_errors="ignore") as container:
             stream = container.streams.video[0]
             key = self.keys[max(0, int(np.searchsorted(self.keys, self.stamps[start], side="right")) - 1)]

@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..blocks import open_block
-from ..checks import Frames, Permit, checked_dtype, checked_shape, truncated, untested, widened
+from ..checks import Frames, Permit, checked_dtype, checked_shape, open_binary, truncated, untested, widened
 from ..hdf5 import open_hdf5
 from ..source import FrameValues, Source, SourceMetadata
 from .calibration import calibration, stage_tilt, started
@@ -78,7 +78,8 @@ class CrossSource(Source):
         size, needed = self.files[0].stat().st_size, self.offset + self.stored.itemsize * math.prod(self.lengths)
         if size < needed:  # to touch a map beyond its file would end the process
             raise truncated(self.path, "before the frames that it held when it was opened", needed, size)
-        stack = np.memmap(self.files[0], self.stored, "r", self.offset, self.lengths)
+        with open_binary(self.files[0]) as file:
+            stack = np.memmap(file, self.stored, "r", self.offset, self.lengths)
         return widened(np.array(np.moveaxis(stack, self.frame_axis, 0)[start:stop], order="C"), self.dtype)
 
 
@@ -90,7 +91,7 @@ def read_document(path: Path, permit: Permit | None) -> Document:
     SourceError
         Where it is damaged, or of another format.
     """
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         is_hdf5 = file.read(len(_HDF5)) == _HDF5
     if is_hdf5:
         tags, types = read_dm5(path, permit)

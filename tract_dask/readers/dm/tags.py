@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 from ...errors import SourceError
-from ..checks import truncated
+from ..checks import open_binary, truncated
 
 Tags: TypeAlias = dict[str, Any]
 """Tags by their names, entries without one by ``[0]``, ``[1]`` ...: numbers, text, an Array, or Tags again."""
@@ -75,7 +75,7 @@ def read_tags(path: Path) -> TagFile:
         Where this is no such file, it ends too early, or its tags contradict it.
     """
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         start = file.read(16)
         version = int.from_bytes(start[:4], "big")
         order_at = {3: 8, 4: 12}.get(version)

@@ -15,7 +15,7 @@ from ...settings.run import SourceSettings
 from ..axes import Axis, Order, ordered, spelled_out
 from ..blocks import fill_from
 from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
-from ..checks import DAMAGE, MOST_FRAMES, Frames, Permit, checked_dtype, checked_file, reading, widened
+from ..checks import DAMAGE, MOST_FRAMES, Frames, Permit, checked_dtype, checked_file, open_binary, reading, widened
 from ..joined import JoinedSource, check_alike
 from ..source import Source, SourceMetadata
 from .axes import axes_of, single, text
@@ -61,7 +61,9 @@ class Hdf5Source(Source):
         with ExitStack() as stack:
             for source, frames in self.sources:  # what libhdf5 cannot open here it reads as zeros
                 if start < frames.stop and frames.start < stop:
+                    checked_file(source)
                     stack.enter_context(h5py.File(source, "r"))
+            checked_file(self.holder)
             file = stack.enter_context(h5py.File(self.holder, "r"))
             return self._taken(file[self.inner], start, stop)
 
@@ -97,7 +99,7 @@ class RawPixelSource(Source):
             count = min(done + segment.n_bytes, first + len(pixels)) - done - skipped
             if count > 0:
                 at = done + skipped - first
-                with reading(str(segment.path)), segment.path.open("rb", buffering=0) as file:
+                with reading(str(segment.path)), open_binary(segment.path, 0) as file:
                     fill_from(file, segment.offset + skipped, pixels[at : at + count], segment.path)
             done += segment.n_bytes
         return widened(frames, self.dtype)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..axes import Order
 from ..blocks import fill_from
-from ..checks import Frames, checked_file, truncated, widened
+from ..checks import Frames, checked_file, open_binary, truncated, widened
 from ..source import FilledSource
 
 FILTER = 32008
@@ -102,7 +102,7 @@ class BitshuffledSource(FilledSource):
 
     def _fill(self, start: int, frames: Frames) -> None:
         checked_file(self.holder)
-        with self.holder.open("rb", buffering=0) as file:
+        with open_binary(self.holder, 0) as file:
             if self._is_a_chunk_a_frame():
                 for k in range(len(frames)):
                     self._fill_frame(file, start + k, frames[k])

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ...errors import SourceError
+from ..checks import open_binary
 
 _SIGN, _HEAD, _OBJECT = b"GCOL", 16, 16
 _WHOLE, _END = 16 << 20, 4 << 20
@@ -21,7 +22,7 @@ def check_heaps(path: Path, size: int) -> None:
     SourceError
         Where one does not.
     """
-    with path.open("rb", buffering=0) as file:
+    with open_binary(path, 0) as file:
         for start in (0,) if size <= _WHOLE else (0, size - _END):
             data = os.pread(file.fileno(), _WHOLE if size <= _WHOLE else _END, start)
             if any(_is_endless(data, at) for at in _signs(data)):

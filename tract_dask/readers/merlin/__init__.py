@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...errors import MissingSourceError, SourceError
 from ...settings.run import SourceSettings
 from ..blocks import BlockSource, checked_records, read_records
-from ..checks import Permit, checked_dtype, checked_file, checked_shape, lies_there, truncated, untested
+from ..checks import Permit, checked_dtype, checked_file, checked_shape, lies_there, open_binary, truncated, untested
 from ..source import SourceMetadata
 from ..times import timed_ticks
 from ..units import to_seconds
@@ -135,7 +135,7 @@ def _text_beside(path: Path, permit: Permit | None) -> dict[str, str]:
     if header is None:
         return {}
     checked_file(header, permit)
-    with header.open("rb") as file:
+    with open_binary(header) as file:
         lines = file.read(_MOST_HEADER_BYTES).decode("latin-1").splitlines()
     if not lines or not lines[0].startswith("HDR"):
         return {}
@@ -158,7 +158,7 @@ class _Header:
 
 def _first(path: Path, text: dict[str, str]) -> _Header:
     """Return the first header, with the counter's depth from it or from the ``.hdr`` file."""
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         data = file.read(_MOST_HEADER_BYTES)
     line = _LINE.match(data)
     kind = line["kind"].decode() if line else ""
@@ -205,7 +205,7 @@ def _goes_on(path: Path, end: int) -> bool:
     """Tell whether the first frame ends here: at the end of the file, or before another header."""
     if path.stat().st_size <= end:
         return path.stat().st_size == end
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         file.seek(end)
         return file.read(4) == b"MQ1,"
 

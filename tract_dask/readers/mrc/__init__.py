@@ -14,7 +14,17 @@ from ...settings.run import SourceSettings
 from ..beside import info_text, known_beside, merged
 from ..beside.direct_electron import fields_of
 from ..blocks import BlockSource, fill_from
-from ..checks import Frames, Permit, checked_dtype, checked_shape, maybe_packed, truncated, unaccounted, untested
+from ..checks import (
+    Frames,
+    Permit,
+    checked_dtype,
+    checked_shape,
+    maybe_packed,
+    open_binary,
+    truncated,
+    unaccounted,
+    untested,
+)
 from ..source import SourceMetadata
 from ..units import square_pixel, to_pm
 from .extended import KINDS, read_extended
@@ -36,7 +46,7 @@ class NibbleSource(BlockSource):
 
     def _fill(self, start: int, frames: Frames) -> None:
         packed = np.empty((self.shape[1], (self.shape[2] + 1) // 2), np.uint8)
-        with self.files[0].open("rb", buffering=0) as file:
+        with open_binary(self.files[0], 0) as file:
             for frame, offset in zip(frames, self.offsets[start : start + len(frames)].tolist(), strict=True):
                 fill_from(file, offset, packed, self.files[0])
                 frame[:, ::2] = packed & 15

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...errors import MissingSourceError, SourceError
 from ...settings.run import SourceSettings
 from ..blocks import BlockSource, checked_records, read_records
-from ..checks import Frames, Permit, checked_dtype, checked_file, checked_shape, lies_there, truncated
+from ..checks import Frames, Permit, checked_dtype, checked_file, checked_shape, lies_there, open_binary, truncated
 from ..source import SourceMetadata
 from ..times import timed_ticks
 from ..units import square_pixel, to_pm, to_seconds
@@ -241,7 +241,7 @@ def _frame_time(path: Path, permit: Permit | None) -> float | None:
     if not lies_there(emi, permit) or not checked_file(emi, permit).st_size:
         return None
     checked_file(emi, permit)
-    with emi.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with open_binary(emi) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         times = {bytes(found[1]) for found in re.finditer(rb"<FrameTime>([0-9.eE+-]{1,30})</FrameTime>", data)}
     try:
         return to_seconds(float(times.pop()), "s") if len(times) == 1 else None

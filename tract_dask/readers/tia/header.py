@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import SourceError
-from ..checks import truncated
+from ..checks import open_binary, truncated
 
 _HEADER = np.dtype("<u2, <u2, <u2, <u4, <u4, <i4, <i4")
 _HEADER.names = ("order", "series", "version", "kind", "tags", "n", "valid")
@@ -49,7 +49,7 @@ def tia_head(path: Path) -> Head:
     SourceError
         Where it is damaged, or not that of a series of images.
     """
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         data = file.read(_HEAD_BYTES)
     if len(data) < _HEADER.itemsize + 12:
         raise truncated(str(path), "in its header", _HEADER.itemsize + 12, len(data))

@@ -21,6 +21,7 @@ from ..checks import (
     Permit,
     checked_claim,
     checked_dtype,
+    checked_file,
     checked_shape,
     maybe_packed,
     truncated,
@@ -61,6 +62,7 @@ class PagedSource(Source):
         frames = np.empty((len(directories), *self.shape[1:]), self.dtype)
         k = 0
         try:
+            checked_file(self.files[0])
             with tifffile.TiffFile(self.files[0]) as tiff:
                 for k, directory in enumerate(directories.tolist()):
                     frames[k] = widened(decoded(tiff, directory, start + k, self.shape[1:]), self.dtype)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..beside import known_beside, merged
-from ..checks import DAMAGE, Frames, Permit, checked_claim, checked_dtype, checked_shape, untested
+from ..checks import DAMAGE, Frames, Permit, checked_claim, checked_dtype, checked_file, checked_shape, untested
 from ..source import Source, SourceMetadata
 from ..units import number, square_pixel, to_pm, to_seconds
 from . import undecoded
@@ -55,6 +55,7 @@ class EerSource(Source):
         frames = np.zeros((max(0, stop - start), *self.shape[1:]), self.dtype)
         first = page = start * self.readouts
         try:
+            checked_file(self.files[0])
             with tifffile.TiffFile(self.files[0]) as tiff:
                 for page in range(first, first + len(frames) * self.readouts):
                     readout = _decoded(tiff, int(self.directories[page]), page, self.shape[1:])

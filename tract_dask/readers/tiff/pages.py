@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import SourceError
-from ..checks import truncated
+from ..checks import open_binary, truncated
 
 Tags: TypeAlias = dict[int, Any]
 """Tag number to value: bytes for text and opaque data, else a tuple of numbers."""
@@ -151,7 +151,7 @@ def walk(path: Path) -> tuple[list[Page], Tags, int]:
         Where the file is no TIFF, ends early, or its chain of pages is damaged.
     """
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         dialect, following = _start(file, path)
         tiff = _Tiff(file, path, size, dialect)
         pages: list[Page] = []

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import open_binary
 from ..source import SourceMetadata
 from ..times import timed
 from ..units import number, quantity, square_pixel, to_pm
@@ -36,7 +37,7 @@ def of_stk(tags: Tags, path: Path) -> tuple[int, SourceMetadata]:
 def _stk_pixel(tags: Tags, path: Path) -> tuple[float | None, tuple[str, ...]]:
     """Return the pixel size: entries of a number and the place of a fraction, or of a text after its length."""
     count, place = tags.get(STK_ABOUT) or (0, 0)
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         file.seek(place)
         entries = dict(struct.iter_unpack("<2I", _whole(file.read(8 * min(count, _MOST_ENTRIES)), 8)))
 

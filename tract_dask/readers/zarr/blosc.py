@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..checks import open_binary
 from .shards import ShardIndex, places_in_shard
 
 _HEAD, _CHECKSUM = 16, 4
@@ -28,7 +29,7 @@ def check_blosc(files: Sequence[Path], chunk_bytes: int, index: ShardIndex | Non
     for path in files:
         size = path.stat().st_size
         places = [(0, size)] if index is None else places_in_shard(path, n_inner, index)
-        with path.open("rb") as file:
+        with open_binary(path) as file:
             for offset, length in places:
                 file.seek(min(offset, size))
                 head = file.read(_HEAD)

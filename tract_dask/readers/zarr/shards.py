@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..checks import open_binary
+
 _MOST_SHARDS = 10_000
 _NOWHERE = int(np.iinfo(np.uint64).max)
 
@@ -86,7 +88,7 @@ def _index_of(file: Path, n_chunks: int, index: ShardIndex) -> NDArray[np.uint64
     n_bytes = 16 * n_chunks
     if file.stat().st_size < n_bytes + index.n_checksum:
         raise ValueError(f"the shard {file.name} is shorter than its index")
-    with file.open("rb") as opened:
+    with open_binary(file) as opened:
         if index.at_end:
             opened.seek(-n_bytes - index.n_checksum, 2)
         return np.frombuffer(opened.read(n_bytes), "<u8").reshape(n_chunks, 2)
