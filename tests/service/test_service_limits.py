@@ -4,7 +4,6 @@ import asyncio
 import gc
 import json
 import os
-import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
