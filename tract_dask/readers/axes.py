@@ -190,7 +190,12 @@ def ordered(axes: Sequence[Axis], shape: tuple[int, ...], where: str) -> Order:
             raise _refused(f"the data have {len(kept)} axes, such as an image at each place of a scan", named, where)
         checked_shape(tuple(shape[k] for k in kept), where)
     places = _places(named, kinds, where)
-    notes = () if any(kinds) or any(axis.in_image is not None for axis in named) else doubts(shape, where)
+    notes = (
+        ()
+        if any(kinds) or any(axis.in_image is not None for axis in named)
+        else doubts(tuple(shape[k] for k in kept), where)
+    )
+    notes += _passed_over([axes[k] for k in range(len(shape)) if k not in kept], where)
     frame, y, x = (None if place is None else kept[place] for place in places)
     assert y is not None
     assert x is not None
@@ -199,14 +204,20 @@ def ordered(axes: Sequence[Axis], shape: tuple[int, ...], where: str) -> Order:
 
 
 def _without_ones(axes: Sequence[Axis], shape: tuple[int, ...]) -> list[int]:
-    """Return the axes without those of length 1 that no movie has: the channel and the depth of OME, one energy."""
+    """Return the axes without those of length 1 that no movie has: channel, depth, one energy, more than three axes."""
     kept = list(range(len(shape)))
     for kind in ("colour", "spectrum", "frame", ""):
         for k in range(len(shape)):
             drops = kind in ("colour", "spectrum") or len(kept) > 3
-            if shape[k] == 1 and k in kept and drops and len(kept) > 2 and axes[k].name and axes[k].kind == kind:
+            if shape[k] == 1 and k in kept and drops and len(kept) > 2 and axes[k].kind == kind:
                 kept.remove(k)
     return kept
+
+
+def _passed_over(axes: list[Axis], where: str) -> tuple[str, ...]:
+    if not axes:
+        return ()
+    return (f"{where}: of the axes, those of length 1 are passed over: {', '.join(map(str, axes))}",)
 
 
 def _check_kinds(axes: list[Axis], kinds: list[str], where: str) -> None:

@@ -276,14 +276,17 @@ def unreadable(where: str, error: OSError, what: str, remedy: str) -> SourceErro
     return SourceError(what, where, got=error.strerror or words(error), remedy=remedy)
 
 
-def unaccounted(where: str, n_bytes: int, frame_bytes: int, least: int | None = None) -> tuple[str, ...]:
-    """Return a note where a file holds bytes, ``least`` or a frame of them, that its header does not account for."""
-    if n_bytes < max(1, frame_bytes if least is None else least):
+def unaccounted(where: str, n_bytes: int, frame_bytes: int, least: int = 1) -> tuple[str, ...]:
+    """Return a note where a file holds bytes, ``least`` of them, that its header does not account for."""
+    if n_bytes < least:
         return ()
-    return (
-        f"{where} holds {n_bytes:,} bytes, as many as {n_bytes / max(1, frame_bytes):.3g} frames, that its header does"
-        " not account for; they are not read",
-    )
+    frames = f", as many as {n_bytes / frame_bytes:.3g} frames," if 0 < frame_bytes <= n_bytes else ""
+    bytes_ = "1 byte" if n_bytes == 1 else f"{n_bytes:,} bytes"
+    return (f"{where} holds {bytes_}{frames} that its header does not account for; they are not read",)
+
+
+FILLING = 4096
+"""In formats whose parts lie anywhere in a file, so many bytes between them may be filling."""
 
 
 _HALVES = {(7420, 3838): "K2", (3838, 7420): "K2", (4092, 2880): "K3", (8184, 5760): "K3"}

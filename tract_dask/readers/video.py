@@ -109,15 +109,18 @@ def open_video(path: Path, inner: str, settings: SourceSettings, permit: Permit 
                 "Export the movie as TIFF or MRC",
             )
         _check_grey(first, path)
+        others = [f"{other.type} {other.index}" for other in container.streams if other is not stream]
         shape = (first.height, first.width)
     deep = kind in _DEEP
+    known = _noted(timed(stamps * base, path.name), path.name, codec)
+    beside = f"{path.name}: its first video is read; the file also holds {', '.join(others[:9])}"
     return VideoSource(
         path=str(path),
         files=(path,),
         format=f"video ({codec})",
         shape=checked_shape((len(stamps), *shape), str(path)),
         dtype=np.dtype("u2" if deep else "u1"),
-        metadata=_noted(timed(stamps * base, path.name), path.name, codec),
+        metadata=replace(known, notes=(*known.notes, *((beside,) if others else ()))),
         stamps=stamps,
         keys=np.array([pts for pts, is_key in packets if is_key] or [stamps[0]], np.int64),
         pixels="gray16le" if deep else "gray",

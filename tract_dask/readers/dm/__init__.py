@@ -19,7 +19,7 @@ from ..source import FrameValues, Source, SourceMetadata
 from .calibration import calibration, stage_tilt, started
 from .dm5 import read_dm5
 from .image import Image, chosen, frame_axis, stored_type
-from .tags import Array, TagFile, Tags, read_tags
+from .tags import Array, TagFile, Tags, entries, read_tags
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _AFTER = 8
@@ -131,6 +131,10 @@ def open_image(
     known = calibration(image)
     metadata = replace(known, notes=notes + known.notes)
     inside = str(image.number)
+    n_left_out = len(entries(image.tags, "ImageData", "Dimensions")) - len(image.axes)
+    if n_left_out > 0 and len(image.axes) > 2:
+        passed = "an axis of length 1 is" if n_left_out == 1 else f"{n_left_out} axes of length 1 are"
+        metadata = replace(metadata, notes=(*metadata.notes, f"{document.path.name}: {passed} passed over"))
     if len(image.axes) == 2:
         metadata = replace(metadata, start_s=started(image), along_frames=_tilt(image))
     if document.types:

@@ -20,10 +20,10 @@ from ..joined import JoinedSource, check_alike
 from ..source import Source, SourceMetadata
 from .axes import axes_of, single, text
 from .bitshuffle import FILTER, BitshuffledSource, chunks_of, codec_of
-from .candidates import ambiguous, movies_of
+from .candidates import ambiguous, movies_of, others_of
 from .dectris import master_metadata, parts_of
 from .links import Access, Behind, Segment, files_behind, follow, movies_below, opened
-from .storage import check_storage
+from .storage import check_storage, outside
 from .velox import is_velox, velox_metadata
 
 
@@ -121,7 +121,7 @@ def open_hdf5(path: Path, inner: str, settings: SourceSettings, permit: Permit |
         if parts := parts_of(file, group):
             return _joined(file, path, inner, parts, permit)
         shown, notes = _chosen(file, inner, path, Access(permit))
-        return _one(file, path, shown, notes, access)
+        return _one(file, path, shown, notes + outside(file, path), access)
 
 
 def _joined(file: Any, path: Path, inner: str, names: list[str], permit: Permit | None) -> Source:
@@ -248,7 +248,8 @@ def _chosen(file: Any, inner: str, path: Path, access: Access) -> tuple[str, tup
     movies = [] if target is None else movies_of(search.found)
     if len(movies) == 1:
         lost = f" (and {len(search.lost) - 1} more)" if len(search.lost) > 1 else ""
-        return movies[0].shown, (f"{path.name}: {search.lost[0]}{lost}",) if search.lost else ()
+        notes = (f"{path.name}: {search.lost[0]}{lost}",) if search.lost else ()
+        return movies[0].shown, notes + others_of(movies[0], search.found, path.name)
     raise ambiguous(path, inner, movies, search.found, search.lost, there=target is not None)
 
 

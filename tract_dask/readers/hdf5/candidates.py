@@ -35,7 +35,20 @@ def movies_of(found: list[Found]) -> list[Found]:
     if len(several[0] or several[1]) == 1 and not (flat[0] and not deep[0]):
         return several[0] or several[1]
     more = [item for item in signals if len(item.shape) > 3]
-    return deep[0] or (flat[0] + deep[1]) or more or flat[1]
+    thin = [item for item in numbers if len(item.shape) > 3 and 1 < sum(length > 1 for length in item.shape) <= 3]
+    return deep[0] or (flat[0] + deep[1]) or more or thin or flat[1]
+
+
+def others_of(movie: Found, found: list[Found], where: str) -> tuple[str, ...]:
+    """Return a note on what lies beside the movie that was chosen and could be a movie, or a reference of its size."""
+    sides = [length for length in movie.shape if length > 1][-2:]
+    numbers = (item for item in found if item.dtype.kind in "iufcb" and item.shown != movie.shown)
+    others = [item for item in numbers if len(item.shape) > 2 or sorted(item.shape) == sorted(sides)]
+    if not others:
+        return ()
+    shown = ", ".join(f"{item.shown} {item.shape}{item.label}" for item in others[:5])
+    more = f" and {len(others) - 5} more" if len(others) > 5 else ""
+    return (f"{where}: {movie.shown} is read; the file also holds {shown}{more}",)
 
 
 def ambiguous(

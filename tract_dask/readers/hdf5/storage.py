@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 
 from ...errors import SourceError
-from ..checks import checked_claim, truncated
+from ..checks import checked_claim, open_binary, truncated, unaccounted
 
 _CHUNK_BYTES, _CHUNK_RATIO = 32 << 20, 100
 """A chunk may claim so many bytes, and so many times the bytes of its file."""
@@ -129,6 +129,25 @@ def _check_sums(dataset: Any, where: str) -> None:
             f"{found.size} bytes for the chunk at {found.chunk_offset}",
             "The file is damaged: make the copy or the export again",
         )
+
+
+_SIGN = b"\x89HDF\r\n\x1a\n"
+_END_AT = {0: 40, 1: 44, 2: 28, 3: 28}
+"""Where the superblock of each version has the end of what belongs to HDF5."""
+
+
+def outside(file: Any, path: Path) -> tuple[str, ...]:
+    """Return notes on bytes of a file that lie before or behind what belongs to HDF5; none of unusual superblocks."""
+    before, size = int(file.userblock_size), path.stat().st_size
+    notes = (f"{path.name}: the {before:,} bytes before its HDF5 data (user block) are not read",) if before else ()
+    with open_binary(path) as opened:
+        opened.seek(before)
+        block = opened.read(52)
+    place = _END_AT.get(block[8]) if len(block) == 52 and block.startswith(_SIGN) else None
+    sizes = block[13] if len(block) == 52 and block[8] < 2 else block[9:10][0] if len(block) == 52 else 0
+    if place is None or sizes != 8:
+        return notes
+    return notes + unaccounted(path.name, size - int.from_bytes(block[place : place + 8], "little"), 0)
 
 
 def _never_written(where: str) -> SourceError:

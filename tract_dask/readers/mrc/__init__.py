@@ -192,7 +192,7 @@ def _count(header: Any, path: Path, offset: int, frame_bytes: int) -> tuple[int,
     if more and (not rest or not n_frames):
         note = f"{path.name}: its header counts {n_frames} frames, the file has {n_frames + more}; all are read"
         return n_frames + more, (note, *unaccounted(path.name, rest, frame_bytes))
-    return n_frames, unaccounted(path.name, size - end, frame_bytes, min(frame_bytes, 4096))
+    return n_frames, unaccounted(path.name, size - end, frame_bytes)
 
 
 def _metadata(header: Any, path: Path, n_frames: int, notes: tuple[str, ...], permit: Permit | None) -> SourceMetadata:

@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 from ...errors import MissingSourceError, SourceError
 from ...settings.run import SourceSettings
 from ..blocks import BlockSource, checked_records, read_records
-from ..checks import Frames, Permit, checked_dtype, checked_file, checked_shape, lies_there, open_binary, truncated
+from ..checks import (
+    FILLING,
+    Frames,
+    Permit,
+    checked_dtype,
+    checked_file,
+    checked_shape,
+    lies_there,
+    open_binary,
+    truncated,
+    unaccounted,
+)
 from ..source import SourceMetadata
 from ..times import timed_ticks
 from ..units import square_pixel, to_pm, to_seconds
@@ -56,14 +67,17 @@ def open_tia(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     stored, shape = _alike(path, elements)
     dtype = checked_dtype(stored, str(path))
     n_frames, n_y, n_x = checked_shape((len(offsets), *shape), str(path))
-    _check_apart(path, _inside(path, offsets, _ELEMENT.itemsize + n_y * n_x * stored.itemsize), n_y * n_x)
+    frame_bytes = n_y * n_x * stored.itemsize
+    _check_apart(path, _inside(path, offsets, _ELEMENT.itemsize + frame_bytes), n_y * n_x)
+    rest = path.stat().st_size - _end(head, offsets + _ELEMENT.itemsize + frame_bytes, tags)
+    known = _metadata(path, head, elements, tags, permit)
     return TiaSource(
         path=str(path),
         files=(path,),
         format="TIA series",
         shape=(n_frames, n_y, n_x),
         dtype=dtype,
-        metadata=_metadata(path, head, elements, tags, permit),
+        metadata=replace(known, notes=known.notes + unaccounted(path.name, rest, frame_bytes, FILLING)),
         offsets=offsets + _ELEMENT.itemsize,
         stored=stored,
     )
@@ -133,6 +147,12 @@ def _tables(path: Path, head: Head) -> tuple[NDArray[np.int64], NDArray[np.int64
     tags = np.fromfile(path, item, head.n_valid, offset=head.table + head.n_elements * item.itemsize)
     tagged = head.tags in _TAGGED and len(tags) == head.n_valid and int(tags.max()) + _TAG.itemsize <= size
     return _positions(path, starts), tags.astype(np.int64) if tagged else np.empty(0, np.int64)
+
+
+def _end(head: Head, ends: NDArray[np.int64], tags: NDArray[np.int64]) -> int:
+    """Return where a file ends by its tables; ``ends`` are those of the images, each with a tag behind it."""
+    tables = head.table + 2 * head.n_elements * head.offset_type.itemsize
+    return max(tables, int(ends.max()) + _TAG.itemsize, int(tags.max(initial=0)) + _TAG.itemsize)
 
 
 def _positions(path: Path, starts: NDArray[Any]) -> NDArray[np.int64]:

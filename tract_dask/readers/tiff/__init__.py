@@ -17,6 +17,7 @@ from ..beside import known_beside, merged
 from ..blocks import BlockSource, flip
 from ..checks import (
     DAMAGE,
+    FILLING,
     Frames,
     Permit,
     checked_claim,
@@ -99,9 +100,9 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit |
     SourceError
         Where the file is damaged or cut short, pages differ, or pixels are colours or complex.
     """
-    pages, tags, tag_bytes = walk(path)
-    stored_bytes = tag_bytes + sum(page.n_stored for page in pages)
-    pages = [page for page in pages if not page.reduced]
+    every, tags, tag_bytes = walk(path)
+    stored_bytes = tag_bytes + sum(page.n_stored for page in every)
+    pages = [page for page in every if not page.reduced]
     if not pages:
         raise SourceError(
             "the movie has no frames", str(path), "at least one page", "none", "Check how it was exported"
@@ -117,7 +118,7 @@ def open_tiff(path: Path, inner: str, settings: SourceSettings, permit: Permit |
     dtype, flipped, notes = _meaning(pages[0], description, path)
     stored_bytes += (n_frames - len(pages)) * pages[0].n_stored if n_frames > len(pages) else 0
     notes += _turned(tags, path) + maybe_packed(dtype, pages[0].shape, path.name)
-    notes += () if SUB_PAGES in tags else unaccounted(path.name, path.stat().st_size - stored_bytes, pages[0].n_stored)
+    notes += _beside(sum(page.reduced for page in every), tags, path, stored_bytes, pages[0].n_stored)
     metadata = replace(description.metadata, notes=(*description.metadata.notes, *notes))
     common: dict[str, Any] = {
         "path": str(path),
@@ -169,6 +170,16 @@ def _meaning(page: Page, description: Description, path: Path) -> tuple[np.dtype
         return dtype, 0, (f"{where} is shown with white for 0 (MinIsWhite); its numbers are read as stored",)
     n_bits = 8 * dtype.itemsize if dtype.kind == "i" else page.n_bits
     return dtype, (1 << n_bits) - 1, (f"{where} stores white as 0 (MinIsWhite); its numbers are turned over",)
+
+
+def _beside(n_reduced: int, tags: Tags, path: Path, stored_bytes: int, frame_bytes: int) -> tuple[str, ...]:
+    """Return notes on what a file holds beside its pages; ``stored_bytes`` are those of pages and tags."""
+    notes: tuple[str, ...] = ()
+    if n_reduced:
+        notes = (f"{path.name}: {n_reduced} of its pages are small copies (thumbnails) and are not read",)
+    if SUB_PAGES in tags:
+        return (*notes, f"{path.name}: its pages have further pages below them (SubIFDs), which are not read")
+    return notes + unaccounted(path.name, path.stat().st_size - stored_bytes, frame_bytes, FILLING)
 
 
 def _turned(tags: Tags, path: Path) -> tuple[str, ...]:

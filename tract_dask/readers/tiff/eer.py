@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..beside import known_beside, merged
-from ..checks import DAMAGE, Frames, Permit, checked_claim, checked_dtype, checked_file, checked_shape, untested
+from ..checks import (
+    DAMAGE,
+    FILLING,
+    Frames,
+    Permit,
+    checked_claim,
+    checked_dtype,
+    checked_file,
+    checked_shape,
+    unaccounted,
+    untested,
+)
 from ..source import Source, SourceMetadata
 from ..units import number, square_pixel, to_pm, to_seconds
 from . import undecoded
@@ -101,7 +112,7 @@ def open_eer(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     SourceError
         Where the file is damaged or has no readouts, or ``inner`` is no such number.
     """
-    pages, tags, _ = walk(path)
+    pages, tags, tag_bytes = walk(path)
     raw = [page for page in pages if page.compression in _CODECS]
     if not raw:
         raise SourceError(
@@ -115,6 +126,10 @@ def open_eer(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     _check(raw, path)
     n_frames = len(raw) // readouts
     metadata = _metadata(tags, len(raw), readouts, path)
+    notes = (f"{path.name}: {len(pages) - len(raw)} of its pages are no readouts, such as a sum, and are not read",)
+    rest = path.stat().st_size - tag_bytes - sum(page.n_stored for page in pages)
+    more = unaccounted(path.name, rest, 0, FILLING)
+    metadata = replace(metadata, notes=(*metadata.notes, *(notes if len(pages) > len(raw) else ()), *more))
     return EerSource(
         path=str(path),
         files=(path,),

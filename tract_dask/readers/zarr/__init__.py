@@ -16,7 +16,7 @@ from ...settings.run import SourceSettings
 from ..axes import Order, ordered, spelled_out
 from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
 from ..checks import Frames, Permit, checked_claim, checked_dtype, checked_file, reading, truncated, widened
-from ..hdf5.candidates import ambiguous, movies_of
+from ..hdf5.candidates import ambiguous, movies_of, others_of
 from ..source import FrameValues, Source, SourceMetadata
 from .blosc import check_blosc
 from .nodes import Node, arrays_below, axes_of, node_at, open_node
@@ -133,7 +133,8 @@ def _chosen(place: Place, inner: str, path: Path) -> tuple[Node, tuple[str, ...]
         raise ambiguous(path, inner, movies, found, lost, there=node is not None)
     chosen = node_at(place, movies[0].shown.strip("/"))
     assert chosen is not None
-    return chosen, (f"{path.name}: {lost[0]}",) if lost else ()
+    notes = (f"{path.name}: {lost[0]}",) if lost else ()
+    return chosen, notes + others_of(movies[0], found, path.name)
 
 
 def _chunk_files(place: Place, node: Node, order: Order, where: str) -> tuple[list[str], NDArray[np.int64], int]:
@@ -193,7 +194,8 @@ def _missing_inside(node: Node, files: dict[str, Path], fill: Any, where: str) -
 
 
 def _doubts(node: Node, order: Order) -> tuple[str, ...]:
-    return () if node.chunk and node.chunk[0] == 1 else order.notes
+    """Return what was guessed about the axes, or passed over; chunks of one frame each leave no doubt."""
+    return () if node.chunk and node.chunk[0] == 1 and len(node.chunk) == 3 else order.notes
 
 
 def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceMetadata:
