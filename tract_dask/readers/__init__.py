@@ -88,11 +88,7 @@ def open_source(
     with reading(name):
         source = _open_list(place, settings, permit) if isinstance(place, list) else _open(place, settings, permit)
     known = agreed(source.metadata, Path(name).name)
-    merged = replace(
-        known,
-        gain=metadata.gain,
-        notes=known.notes + _not_applied(known),
-    )
+    merged = replace(known, notes=known.notes + _not_applied(known))
     listed = tuple(place) if isinstance(place, list) else ()
     part = select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
     return replace(part, metadata=overridden(part.metadata, metadata, settings))

@@ -249,7 +249,7 @@ def _metadata(
         frame_time_s=seconds,
         notes=(*known.notes, *_said(frames, field, settings, shape)),
         along_frames=along,
-        part=Part(frames.start, frames.step, field[0], field[2], settings.bin),
+        part=(known.part or Part()).of(Part(frames.start, frames.step, field[0], field[2], settings.bin)),
     )
 
 

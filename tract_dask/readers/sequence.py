@@ -149,6 +149,7 @@ def _joined(known: Sequence[SourceMetadata], lengths: Sequence[int], names: Sequ
         frame_time_s=times.frame_time_s or first.frame_time_s,
         notes=_notes(known, names) + _changes(known, names) + times.notes,
         along_frames={**along, **times.along_frames},
+        part=None,
     )
 
 

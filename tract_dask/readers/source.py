@@ -50,6 +50,22 @@ class Part:
     left: int = 0
     bin_px: int = 1
 
+    def of(self, inner: Part) -> Part:
+        """Return which part of the movie on disk a part of this part is.
+
+        Examples
+        --------
+        >>> Part(10, 2, top=8, left=4, bin_px=2).of(Part(3, 5, top=1, bin_px=4))
+        Part(first_frame=16, frame_step=10, top=10, left=4, bin_px=8)
+        """
+        return Part(
+            self.first_frame + self.frame_step * inner.first_frame,
+            self.frame_step * inner.frame_step,
+            self.top + self.bin_px * inner.top,
+            self.left + self.bin_px * inner.left,
+            self.bin_px * inner.bin_px,
+        )
+
 
 @dataclass(frozen=True)
 class SourceMetadata:

@@ -94,6 +94,7 @@ def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> Non
     places = positions(columns)
     outside = np.flatnonzero(~is_inside(places, shape))
     if len(outside):
+        exchanged = bool(is_inside(places[:, ::-1], shape).all())
         first = int(outside[0])
         x, y = places[first]
         raise SettingsError(
@@ -102,7 +103,10 @@ def check_inside(columns: xr.Dataset, shape: tuple[int, ...], where: str) -> Non
             f"x from 0 to {shape[1] - 1}, y from 0 to {shape[0] - 1}",
             f"column {columns['column_id'].to_numpy()[first]} at x {x:g}, y {y:g}"
             + (" first" if len(outside) > 1 else ""),
-            "Give positions in px of the summed image (check that x and y are not exchanged), or remove these columns",
+            "x and y are exchanged, as it seems: all columns lie inside with x as y"
+            if exchanged
+            else "Give positions in px of the summed image, or remove these columns; of a movie read with --roi or"
+            " --bin they are pixels of that part, as in its own columns.csv, and not those of the whole movie",
         )
 
 

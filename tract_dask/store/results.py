@@ -24,6 +24,7 @@ from .journal import Journal, journal_beside
 from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
 from .schema import REJECTED, Status
 from .shard_files import CHUNK_KEYS, chunk_path, codecs
+from .source_pixels import with_source_coordinates
 
 _SCALES = schema.CALIBRATION[:-1]
 """What pixels and frames mean: attributes of the store, which any reader finds there."""
@@ -258,7 +259,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     dataset.attrs |= part_attributes(about.get("part"))
     settings = from_toml(FitSettings, about["settings"], str(path))
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
-    return dataset
+    return with_source_coordinates(dataset)
 
 
 def part_attributes(part: Mapping[str, int] | None) -> dict[str, int]:

@@ -187,6 +187,14 @@ FRAME_VALUES = _declare(
 """What the headers of frames may say: ``frame_`` and the name in movie.zarr, coordinates on ``frame`` in the tracks."""
 
 
+SOURCE = _declare(
+    Variable("source_frame", ("frame",), "int64", "", "Number of the frame in the movie on disk", -1),
+    Variable("x_source_px", ("column_id",), "float64", "px", "x_ref in the pixels of the movie on disk", _NAN),
+    Variable("y_source_px", ("column_id",), "float64", "px", "y_ref in the pixels of the movie on disk", _NAN),
+)
+"""Coordinates of tracks of which only a part of the movie on disk was read; they are computed, not stored."""
+
+
 def texts(values: Iterable[str]) -> np.ndarray[Any, Any]:
     """Return strings as an array of objects: the only form of text that Zarr v3 stores by its specification."""
     return np.array([str(value) for value in values], dtype=object)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from ..axes import Order, ordered, spelled_out
 from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
 from ..checks import Frames, Permit, checked_claim, checked_dtype, checked_file, reading, truncated, widened
 from ..hdf5.candidates import ambiguous, movies_of, others_of
-from ..source import FrameValues, Source, SourceMetadata
+from ..source import FrameValues, Part, Source, SourceMetadata
 from .blosc import check_blosc
 from .nodes import Node, arrays_below, axes_of, node_at, open_node
 from .place import Place, open_place, plain_path
@@ -220,16 +220,26 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
             "the movie store is unfinished", str(path), "a finished one", "", "Run the command that writes it again"
         )
     known = {name: as_number(store.get(name)) for name in ("pixel_size_pm", "frame_time_s", "dose", "gain")}
-    gain = known["gain"]
-    note = f"{path.name}: the movie was converted with a gain of {gain:g}; give it again with --gain {gain:g}"
+    gain = _or_none(known["gain"]) or 1.0
+    note = f"{path.name}: the movie was converted with a gain of {gain:g}, which is used"
     return replace(
         said,
         pixel_size_pm=_or_none(known["pixel_size_pm"]),
         frame_time_s=_or_none(known["frame_time_s"]),
         dose=_or_none(known["dose"]),
         along_frames={**said.along_frames, **_along(place, above, store)},
-        notes=said.notes + ((note,) if gain not in (1.0, math.nan) and gain == gain else ()),
+        gain=gain,
+        part=_part(store.get("part")),
+        notes=said.notes + ((note,) if gain != 1.0 else ()),
     )
+
+
+def _part(said: Any) -> Part | None:
+    """Return which part of its own source a movie store is; None where it is all of it, or that is damaged."""
+    names = {field.name for field in fields(Part)}
+    if not isinstance(said, dict) or set(said) != names or not all(type(value) is int for value in said.values()):
+        return None
+    return Part(**said)
 
 
 def _along(place: Place, group: Node | None, store: dict[str, Any]) -> dict[str, FrameValues]:

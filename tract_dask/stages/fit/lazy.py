@@ -7,6 +7,7 @@ import xarray as xr
 from ...settings.run import FitSettings
 from ...store import results, schema
 from ...store.movie import Movie
+from ...store.source_pixels import with_source_coordinates
 from .job import calibration, prepare
 from .measure import Values, measure
 
@@ -67,4 +68,5 @@ def fit_columns(
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", movie.times(), schema.RESULTS["time"].attributes)
     dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window_px, job.reference_blur_px)
-    return dataset
+    dataset.attrs |= results.part_attributes(movie.part)
+    return with_source_coordinates(dataset)
