@@ -24,7 +24,7 @@ STAGES = ("convert", "drift", "sum", "columns", "fit")
 REPORT = "report"
 """What a run makes after its stages."""
 
-_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0)
+_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
 
 
 @dataclass(frozen=True)
@@ -135,15 +135,19 @@ class JsonLines:
         The file; made at the first event.
     warn
         Takes a warning, once, where a line could not be written.
+    is_held
+        Tells whether the file's folder is still the one that it was; nothing is written where it is not.
     """
 
-    def __init__(self, path: Path, warn: Sink = silent) -> None:
-        self.path, self._warn = path, warn
+    def __init__(self, path: Path, warn: Sink = silent, is_held: Callable[[Path], bool] = lambda path: True) -> None:
+        self.path, self._warn, self._is_held = path, warn, is_held
         self._is_whole, self._warned = False, False
 
     def __call__(self, event: Event) -> None:
         """Append one line in one call; a line before it that a killed run or a full disk has torn is ended first."""
         try:
+            if not self._is_held(self.path):
+                return
             self._append(f"{json.dumps(to_record(event))}\n".encode())
         except OSError as error:
             self._is_whole = False

@@ -119,7 +119,7 @@ PLACES = [
     ("open", "sum.zarr.journal"),
     ("os.rename", "/sum.zarr.journal"),  # the journal is taken away
     ("os.rename", "/.columns.csv.*.partial"),
-    ("os.rename", "/.columns.png.partial.png"),
+    ("os.rename", "/.columns.png.*.partial.png"),
     ("open", "columns.zarr/"),
     ("open", "results.zarr/zarr.json"),
     ("os.rename", "results.zarr"),

@@ -24,7 +24,7 @@ from tract_dask.service.notebook import ColumnEditor, edit_columns, edit_table
 from tract_dask.settings import RunSettings
 from tract_dask.stages.columns.sites import lattice_columns
 from tract_dask.store import datasets
-from tract_dask.store.columns import column_dataset, positions, read_columns_csv, write_columns_csv
+from tract_dask.store.columns import column_dataset, columns_csv, positions, read_columns_csv
 
 SHAPE = (200, 240)
 SPACING = 30.0
@@ -396,7 +396,7 @@ def test_the_folder_of_a_run_is_enough(tmp_path: Any) -> None:
 def test_the_command_line_writes_what_was_saved(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A browser that saves two of five columns, one of them moved, and is done."""
     table = tmp_path / "columns.csv"
-    write_columns_csv(column_dataset(TRUTH[:5]), table)
+    (table).write_text(columns_csv(column_dataset(TRUTH[:5])))
     datasets.write_dataset(summed(TRUTH), tmp_path / "columns_sum.zarr")
     opened: list[str] = []
 

@@ -95,7 +95,7 @@ def test_one_that_lives_is_not_pushed_aside_and_one_that_was_killed_is(held, loc
 def test_a_number_that_another_process_has_now_is_no_holder(lock, monkeypatch):
     without_locks(monkeypatch)
     beside = lock.with_name(".lock.holder")
-    record = {"token": "a", "host": "here", "place": locks._place(), "pid": os.getpid(), "started": "1"}
+    record = {"token": "a", "host": "here", "place": locks.machine(), "pid": os.getpid(), "started": "1"}
     beside.write_text(json.dumps(record))
     take(lock)
 

@@ -29,6 +29,7 @@ from ..stages.fit.stage import FitSummary, fit_stage
 from ..stages.fit.vacuum import check_box
 from ..stages.sum import sum_stage
 from ..store import files, metadata
+from ..store.held import is_held
 from ..store.journal import journal_beside, remove_journal
 from ..store.movie import Movie
 from ..store.run_folder import RunFolder, sole_run
@@ -155,7 +156,7 @@ def _run(
 ) -> RunOutcome:
     """Run the stages in their order, and stop after ``until``."""
     record, made = Record(), _Made()
-    send = tee((record, JsonLines(outputs.events, on_event), on_event))
+    send = tee((record, JsonLines(outputs.events, on_event, is_held), on_event))
     plan = plan_run(source.shape, source.dtype, settings)
     with Session(source.path, outputs.root, settings.cluster, client, send, plan) as session:
         session.attempt(partial(files.write_aside, outputs.settings, _run_toml(settings, {}).encode()))

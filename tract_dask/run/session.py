@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -23,6 +24,7 @@ from ..errors import StoreError
 from ..progress import Event, RunDone, RunStarted, RunState, Sink, StageDone, Warned
 from ..settings.cluster import ClusterSettings
 from ..store import disk
+from ..store.held import check_held
 from .plan import Plan
 
 
@@ -135,6 +137,8 @@ def draw_columns(summed: xr.Dataset, columns: xr.Dataset, figure: Path) -> None:
     """Draw the columns beside the place of their figure, then put them there, so that a figure is always whole."""
     from ..plots.columns import plot_columns  # matplotlib takes its time, and not every run draws
 
-    partial_figure = disk.aside(figure, suffix=figure.suffix)
+    partial_figure = disk.aside(figure, uuid.uuid4().hex, figure.suffix)
+    check_held(figure)
     plot_columns(summed, columns, partial_figure)
+    check_held(figure)
     partial_figure.replace(figure)

@@ -16,6 +16,7 @@ from pathlib import Path
 from ..errors import TractError
 from ..store import files, metadata
 from ..store.disk import PARTIAL
+from ..store.held import check_held, hold
 from ..store.journal import journal_beside
 from ..store.locks import lock_files, sole_use
 from ..store.run_folder import RunFolder
@@ -61,7 +62,12 @@ def _delete_folder(root: DataRoot, store: JobStore, deletion: Deletion) -> str:
             return f"job {other} uses it, too"
         if not place.exists():
             return ""
-        with sole_use(place / LOCK, "another run works in this folder"):
+        found = read_mark(place)
+        if found is not None and found.job != deletion.job_id:
+            return f"job {found.job} has worked in it since"
+        with hold(place, links=False), sole_use(place / LOCK, "another run works in this folder"):
+            if Path(os.path.realpath(place)) != place:
+                return "a link leads to it"
             kept = _delete(place, Mark(deletion.owner, deletion.job_id, deletion.output))
         with suppress(OSError):  # something else is in it
             place.rmdir()
@@ -94,6 +100,7 @@ def _delete(place: Path, mark: Mark) -> str:
             _remove(path)
     for aside in (*place.glob(f".*{PARTIAL}"), *place.glob(".*.removed")):
         _clear(aside)
+    check_held(place / MARK)
     for file in () if changed else (place / MARK, *lock_files(place / LOCK)):
         file.unlink(missing_ok=True)
     return f"{', '.join(changed)} changed since the job wrote it" if changed else ""
@@ -123,6 +130,7 @@ def _clear(path: Path) -> None:
 
 def _remove(path: Path) -> None:
     """Delete a file, or of a store what a run writes into it."""
+    check_held(path)
     if path.is_symlink():
         return
     if not path.is_dir():
@@ -131,6 +139,7 @@ def _remove(path: Path) -> None:
     metadata.abandon(path)
     for folder, _, names in os.walk(path, topdown=False):
         for file in (Path(folder, name) for name in names if _OF_A_STORE.fullmatch(name)):
+            check_held(file)
             if not file.is_symlink():
                 file.unlink()
         with suppress(OSError):  # something else is in it

@@ -13,7 +13,7 @@ import secrets
 import shutil
 import unicodedata
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -21,6 +21,7 @@ from ..errors import DestinationError
 from ..readers.movie_files import WILD
 from ..store import files
 from ..store.files import read_small
+from ..store.held import hold
 from ..store.locks import sole_use
 from ..store.run_folder import RunFolder
 from .data_root import DataRoot, OutsideError, folded
@@ -166,14 +167,33 @@ def claim(root: DataRoot, mark: Mark, patience_s: float = 0.0) -> None:
     raise _refused("another program keeps removing this folder", mark.output, "a folder that no other program uses")
 
 
+@contextmanager
+def claimed(root: DataRoot, mark: Mark) -> Iterator[None]:
+    """Let nothing in this block write anywhere but into the folder that :func:`claim` gave, nor through a link in it.
+
+    Raises
+    ------
+    ForbiddenError, DestinationError
+        Where another folder has taken its place meanwhile; in this block, where one does so later.
+    """
+    with hold(root.path / mark.output, links=False):
+        check_owner(root, mark)
+        yield
+
+
 def seal(root: DataRoot, mark: Mark) -> None:
     """Note in the mark what the job has left in its folder, now that it has ended."""
     place = root.path / mark.output
-    found = read_mark(place)
+    found = read_mark(place) if _is_itself(place) else None
     if found is not None and found.job == mark.job:
         made = {path.name: signature(path) for path in RunFolder(place).written() if path.exists()}
         with suppress(OSError):  # on a full disk nothing is noted, and what has a run's name counts as the job's
             write_mark(place, replace(found, made=made))
+
+
+def _is_itself(place: Path) -> bool:
+    """Tell whether no link leads to a folder."""
+    return Path(os.path.realpath(place)) == place
 
 
 def signature(path: Path) -> list[int]:

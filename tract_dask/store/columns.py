@@ -144,11 +144,6 @@ def flag_names(status: int) -> list[str]:
     return [name for name, flag in _FLAGS.items() if status & flag]
 
 
-def write_columns_csv(columns: xr.Dataset, path: str | Path) -> None:
-    """Write columns to a CSV file, as :func:`columns_csv` gives them."""
-    Path(path).write_text(columns_csv(columns), encoding="utf-8", newline="")
-
-
 def read_columns_csv(path: str | Path) -> xr.Dataset:
     """Return the columns of a CSV file, as :func:`parse_columns_csv` understands it.
 

@@ -18,6 +18,7 @@ from ..errors import MissingStoreError, StoreError
 from . import disk
 from .damage import CHECKED, METADATA, damaged, reading, unreadable
 from .files import disk_errors, remove
+from .held import check_held
 from .metadata import FORMAT, attributes, check_named, check_nodes, format_of, seal
 from .schema import texts
 from .shard_files import CHUNK_KEYS
@@ -107,6 +108,7 @@ def write_arrays(dataset: xr.Dataset, path: Path) -> None:
 
 def overwrite_array(path: Path, values: NDArray[Any]) -> None:
     """Write all values of an array of a store anew."""
+    check_held(path / METADATA)
     with _configured(_WRITE_ALL):
         with _opening(path):
             array = zarr.open_array(path, mode="r+", zarr_format=3)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import DestinationError
+from .held import check_held
 
 _WRITE_BACK = 2
 """SYNC_FILE_RANGE_WRITE: start writing, and do not wait."""
@@ -60,6 +61,7 @@ class Batch:
         """Sync all that is kept, then put it in place."""
         sync_all({now for now, _ in self._ready})
         for now, written in self._ready:
+            check_held(written.path)
             if now != written.path:
                 now.replace(written.path)
         self._ready = []
@@ -116,6 +118,7 @@ def place(aside: Path, path: Path) -> None:
 def place_now(aside: Path, path: Path) -> None:
     """Put a file that is whole in its place: synced, then renamed, and the name synced too."""
     sync(aside)
+    check_held(path)
     aside.replace(path)
     sync(path.parent)
 
@@ -125,6 +128,7 @@ def place_folder(aside: Path, path: Path) -> None:
     walked = _walk(aside)
     sync_all([folder / name for folder, names in walked for name in names])
     sync_all([folder for folder, _ in walked])
+    check_held(path)
     aside.replace(path)
     sync(path.parent)
 
@@ -147,6 +151,7 @@ def _walk(top: Path) -> list[tuple[Path, list[str]]]:
 
 def append(path: Path, data: bytes) -> None:
     """Write data at the end of a file that no other thread writes; synced, in an open batch when that is committed."""
+    check_held(path)
     with path.open("ab") as file:
         file.write(data)
         end = file.tell()

@@ -12,14 +12,21 @@ from pathlib import Path
 
 from ..errors import StoreError
 from . import disk
+from .held import check_held
 
 
 def write_aside(path: Path, data: bytes) -> None:
     """Write a small file so that it is either whole or not there: beside its place first, synced, then renamed."""
     aside = disk.aside(path, os.getpid())
+    check_held(path)
     with disk_errors(path):
-        aside.write_bytes(data)
+        with open(aside, "wb", opener=_no_link) as file:
+            file.write(data)
         disk.place_now(aside, path)
+
+
+def _no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def remove(path: Path) -> None:
@@ -27,6 +34,7 @@ def remove(path: Path) -> None:
 
     A folder goes at once for everybody who looks, also where this process is killed meanwhile: renamed, then deleted.
     """
+    check_held(path)
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         path.unlink(missing_ok=True)
         return

@@ -17,15 +17,16 @@ import os
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import StoreError, TractError
+from ..errors import DestinationError, StoreError, TractError
 from . import disk
 from .files import disk_errors, remove, write_aside
+from .held import Folder, around, check_held, hold
 from .metadata import json_ready
 from .shard_files import crc32c
 from .shards import Shard
@@ -38,6 +39,8 @@ _TAIL_BYTES = 4096
 
 _LINE_BYTES = 64 << 20
 """No line is longer; a longer one is damage."""
+
+_SUFFIX = ".journal"
 
 GROWING = ".parts"
 """Suffix of files that a line names a piece of, and that may have grown since."""
@@ -54,7 +57,12 @@ Mark: TypeAlias = tuple[str, int, int]
 
 def journal_beside(path: Path) -> Path:
     """Return the folder of the journal of the store at ``path``, which is there while the store is unfinished."""
-    return path.with_name(f"{path.name}.journal")
+    return path.with_name(f"{path.name}{_SUFFIX}")
+
+
+def _home(journal: Path) -> Path:
+    """Return the folder of the store of a journal, or of one inside another's."""
+    return journal.parent.parent if journal.parent.name.endswith(_SUFFIX) else journal.parent
 
 
 def remove_journal(folder: Path) -> None:
@@ -129,6 +137,9 @@ class Journal:
     def __init__(self, folder: Path, key: str, fields: Fields | None = None, *, run: str = "") -> None:
         self.folder, self.key, self.fields = folder, key, fields or {}
         self.path = folder / (run or self._run() or self._begin())
+        store = folder.with_name(folder.name.removesuffix(_SUFFIX))
+        self._around = () if run else tuple(around(folder)) or (Folder.at(_home(folder)),)
+        self._store = (Folder.at(store),) if not run and store != folder and store.is_dir() else ()
 
     @classmethod
     def existing(cls, folder: Path, key: str) -> Journal | None:
@@ -143,25 +154,32 @@ class Journal:
 
     def _begin(self) -> str:
         remove_journal(self.folder)
+        check_held(self.folder)
         run = f"{hashlib.sha256(self.key.encode()).hexdigest()[:16]}-{uuid.uuid4().hex[:8]}"
         (self.folder / run).mkdir(parents=True)
         write_aside(self.folder / "key", f"{self.key}\n{run}".encode())
         return run
 
     def check(self) -> None:
-        """Check that the run is still the current one.
+        """Check that the run is still the current one, and works in the folders in which it began.
 
         Raises
         ------
         StoreError
             Where another has taken its place, or it is over.
+        DestinationError
+            Where its folder or its store was replaced.
         """
+        for place in self._around:
+            place.check()
         if self._run() != self.path.name:
             if not self.folder.parent.is_dir():
                 raise _gone(self.folder.parent) from None
             now = _current(self.folder)[1]
             got = f"run {now}" if now else "none: the run is over"
             raise left_over(self.folder, f"run {self.path.name}", got) from None
+        for place in self._store:
+            place.check()
 
     @contextmanager
     def batch(self) -> Iterator[Callable[[Shard, Payload], None]]:
@@ -171,7 +189,7 @@ class Journal:
         where a later task of the batch has failed.
         """
         done: list[tuple[Shard, Payload, list[disk.Written]]] = []
-        with self._only_the_current_run(), disk.together() as files:
+        with self._only_the_current_run(), self._held(), disk.together() as files:
             try:
                 yield lambda shard, payload: done.append((shard, payload, files.keep()))
             except Exception:
@@ -207,11 +225,18 @@ class Journal:
             return os.path.relpath(path, self.path), end, _tail(file.fileno(), end)
 
     @contextmanager
+    def _held(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            for place in (*self._around, *self._store):
+                stack.enter_context(hold(place))
+            yield
+
+    @contextmanager
     def _only_the_current_run(self) -> Iterator[None]:
-        """Where something is missing because the run is over, say that."""
+        """Where something is missing, or another, because the run is over, say that."""
         try:
             yield
-        except OSError:
+        except (OSError, DestinationError):
             self.check()
             raise
 

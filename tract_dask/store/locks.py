@@ -22,9 +22,8 @@ import threading
 import uuid
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from io import FileIO
 from pathlib import Path
 from time import monotonic, sleep, time
@@ -32,6 +31,7 @@ from typing import TypeAlias
 
 from ..errors import DestinationError
 from .files import read_small
+from .held import hold, is_held, machine
 
 BEAT_S = 5.0
 """Time between two signs of life."""
@@ -51,21 +51,25 @@ _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.
 def sole_use(lock: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the file ``lock`` against other processes, on this machine and others; it ends with the process.
 
+    Meanwhile nothing is written or deleted under its folder where another takes that one's place, see :mod:`.held`.
+
     Raises
     ------
     DestinationError
         Saying ``what`` another process does, where it holds the lock and still does after ``patience_s``; also where
-        the lock cannot be made, or another machine took it over because this process had stood still for too long.
+        the lock cannot be made, its folder was replaced, or another machine took it over because this process had
+        stood still for too long.
     FileNotFoundError
         Where its folder is not there.
     """
-    try:
-        descriptor = os.open(lock, _OPEN, 0o666)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise _no_lock(lock, error) from error
-    with os.fdopen(descriptor, "r+b", buffering=0) as file:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(hold(lock.parent))
+            file = stack.enter_context(FileIO(os.open(lock, _OPEN, 0o666), "r+"))
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise _no_lock(lock, error) from error
         record = _wait(file, lock, what, patience_s)
         beating = _Beat(_beside(lock), record)
         try:
@@ -143,7 +147,7 @@ class _Record:
     @property
     def is_dead(self) -> bool | None:
         """Whether its process has ended; None where that cannot be seen."""
-        if self.place != _place():
+        if self.place != machine():
             return None
         if self.pid == os.getpid() and self.started == _started(self.pid):
             return self.token not in _held_here  # a folder that was moved meanwhile keeps its record
@@ -174,7 +178,7 @@ _Watches: TypeAlias = defaultdict[Path, _Watch]
 
 def _take(beside: Path, kernel: bool, watches: _Watches) -> _Record | None:
     """Leave a record if there is none that holds; None where there is."""
-    own = _Record(uuid.uuid4().hex, platform.node(), _place(), os.getpid(), _started(os.getpid()))
+    own = _Record(uuid.uuid4().hex, platform.node(), machine(), os.getpid(), _started(os.getpid()))
     _held_here.add(own.token)
     try:
         if _write_new(beside, own):
@@ -261,18 +265,22 @@ class _Beat:
     def _go(self) -> None:
         while not self._ending.wait(BEAT_S):
             found = _read(self._beside)
-            if found is not None and found.token != self._record.token:
-                self.lost = True
-                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-                return
             with suppress(OSError):  # the next one may go well
+                if not is_held(self._beside):
+                    continue  # another folder lies there: what the run writes next says so
+                if found is not None and found.token != self._record.token:
+                    self.lost = True
+                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                    return
                 if found is not None or not _write_new(self._beside, self._record):
                     os.utime(self._beside)
 
     def end(self) -> None:
         self._ending.set()
         self._thread.join(_END_S)  # it may wait for a dead disk
-        _remove(self._beside, self._record)
+        with suppress(OSError):
+            if is_held(self._beside):
+                _remove(self._beside, self._record)
         _held_here.discard(self._record.token)
 
 
@@ -287,17 +295,6 @@ def _guard(beside: Path) -> Path:
 
 def _beside(lock: Path) -> Path:
     return lock.with_name(f"{lock.name}.holder")
-
-
-@lru_cache(maxsize=1)
-def _place() -> str:
-    """Return what tells a running system and a container from all others."""
-    parts = [platform.node()]
-    with suppress(OSError):
-        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
-    with suppress(OSError):
-        parts.append(str(Path("/proc/self/ns/pid").readlink()))
-    return " ".join(parts)
 
 
 def _runs(pid: int) -> bool:

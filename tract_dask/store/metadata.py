@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import DestinationError, MissingStoreError, StoreError, TractError
 from .damage import METADATA, damaged, read_json
 from .files import write_aside
+from .held import check_held
 from .shard_files import crc32c
 
 ATTRIBUTE = "tract_dask"
@@ -250,6 +251,7 @@ def check_destination(path: Path, *, overwrite: bool = False) -> None:
     if not overwrite:
         check_place(path)
     folder = path.parent
+    check_held(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".{path.name}.{os.getpid()}.probe"

@@ -27,7 +27,7 @@ from ...settings.toml import from_dict
 from ...store import metadata, run_folder
 from ...store.files import remove, write_aside
 from ..data_root import DataRoot
-from ..outputs import Mark, claim
+from ..outputs import Mark, claim, claimed
 from .timeline import Timeline
 
 PROGRESS_S = 0.35
@@ -114,7 +114,15 @@ def run_order(order: dict[str, Any], on_event: Reporter) -> pipeline.RunOutcome:
     settings = from_dict(RunSettings, {**order["settings"], "cluster": order["cluster"]})
     root, mark = DataRoot(Path(order["root"]), tuple(map(Path, order["closed"]))), Mark(**order["mark"])
     persist(partial(claim, root, mark, PATIENCE_S), on_event, order["output"])
-    outputs, columns = run_folder.RunFolder(Path(order["output"])), order["columns"]
+    with claimed(root, mark):
+        return _run_in(run_folder.RunFolder(Path(order["output"])), order, root, settings, on_event)
+
+
+def _run_in(
+    outputs: run_folder.RunFolder, order: dict[str, Any], root: DataRoot, settings: RunSettings, on_event: Reporter
+) -> pipeline.RunOutcome:
+    """Do what the order says, in the folder that its job has."""
+    columns = order["columns"]
     run = partial(pipeline.run, _source(order), outputs.root, settings, patience_s=PATIENCE_S, permit=root.permit)
     if columns is not None:  # an edited table is one that differs from that of a finished stage
         sink = silent if outputs.columns.exists() else on_event

@@ -18,8 +18,9 @@ import xarray as xr
 from ...errors import DestinationError
 from ...progress import Sink, StageDone, StageStarted, Warned, silent
 from ...settings.run import ColumnSettings, FitSettings
-from ...store import datasets, disk, files, metadata
-from ...store.columns import check_inside, read_columns_csv, write_columns_csv
+from ...store import datasets, files, metadata
+from ...store.columns import check_inside, columns_csv, read_columns_csv
+from ...store.held import check_held
 from ...store.keys import counted, stage_key
 from ...store.schema import Status
 from ..keep import content, save
@@ -75,13 +76,14 @@ def columns_stage(
         found, edited = _found(find, before, settings, on_event)
         key = _columns_key(summed, counts, before.content if edited else before.given)
     found.attrs["pixel_size_pm"] = pixel_size
-    table = before.content if same or edited else _render(found, csv)
+    table = before.content if same or edited else columns_csv(found).encode()
     if table != before.content:
         before.make_room(on_event)  # before the store, which would else take the old table for an edited one
     known = {"table": _digest(table), "edited": edited, "seeds": before.origin, "pixel_size_pm": pixel_size}
     save(found, store, key, settings, "columns", **known)
     if not csv.exists():
         files.write_aside(csv, table)
+    check_held(figure)
     figure.unlink(missing_ok=True)  # it is of other columns
     draw(summed, found.copy(), figure)
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
@@ -188,6 +190,7 @@ class _Table:
         now = content(self.csv)
         if now and (self.is_changed or not self.about or now != self.content):
             put_away(self.csv, on_event)
+        check_held(self.csv)
         self.csv.unlink(missing_ok=True)
 
 
@@ -201,7 +204,7 @@ def _found(
     lost = bool(before.content) and not before.about and not before.is_foreign
     if not before.is_edited:
         found = find(settings)
-        if not lost or _render(found, before.csv) == before.content:
+        if not lost or columns_csv(found).encode() == before.content:
             return found, False
     on_event(Warned(f"{before.csv.name} was edited: your columns are kept, and refined on the summed image"))
     return find(dataclasses.replace(settings, method="csv", csv=str(before.csv))), True
@@ -212,15 +215,6 @@ def reopened(store: Path) -> xr.Dataset:
     found = datasets.open_dataset(store)
     del found.attrs[metadata.ATTRIBUTE]
     return found
-
-
-def _render(columns: xr.Dataset, csv: Path) -> bytes:
-    """Return the table of ``columns`` as it will stand in ``csv``."""
-    aside = disk.aside(csv)
-    write_columns_csv(columns, aside)
-    table = aside.read_bytes()
-    aside.unlink()
-    return table
 
 
 def _digest(data: bytes) -> str:
@@ -242,6 +236,7 @@ def put_away(csv: Path, on_event: Sink) -> None:
     """Keep a table that was edited by hand under another name, under which nothing lies yet."""
     names = (csv.with_stem(f"{csv.stem}-edited{suffix}") for suffix in chain([""], (f"-{k}" for k in count(2))))
     kept = next(path for path in names if not path.exists() or path.read_bytes() == csv.read_bytes())
+    check_held(csv)
     csv.replace(kept)
     on_event(Warned(f"other columns take the place of {csv.name}: your edited table is now {kept.name}"))
 
@@ -252,6 +247,7 @@ def clear_columns(csv: Path, on_event: Sink, *, keep_edited: bool) -> None:
         files.remove(csv.with_suffix(".zarr"))
     before = _Table.read(csv, ColumnSettings())
     edited = before.is_changed or bool(before.content and not before.about)
+    check_held(csv)
     csv.with_suffix(".png").unlink(missing_ok=True)
     if edited and keep_edited and not before.is_foreign:
         return

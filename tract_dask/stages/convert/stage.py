@@ -28,6 +28,7 @@ from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, Sour
 from ...settings.toml import from_toml, to_toml
 from ...store import datasets, disk, schema
 from ...store.files import disk_errors, remove
+from ...store.held import Folder, hold
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.layout import Layout, disk_bytes, plan_layout
 from ...store.metadata import FORMAT, attributes, check_destination, check_nodes, format_of, is_of_system, is_sound
@@ -121,7 +122,8 @@ def convert(
     on_event(announce(done_frames=journal.frames_done(shards)))
     stamps = origin_of(movie).stamps
     job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, stamps, movie.permit)
-    finalise(path, _write_shards(movie, job, shards, journal, workers, on_event), known)
+    with hold(Folder.at(path)):
+        finalise(path, _write_shards(movie, job, shards, journal, workers, on_event), known)
     journal.remove()
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
     return path

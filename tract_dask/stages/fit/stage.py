@@ -15,6 +15,7 @@ from ...cluster.tasks import stream_shards
 from ...progress import ShardDone, Sink, StageDone, StageStarted, Warned, silent
 from ...settings.run import FitSettings
 from ...store import metadata, results
+from ...store.held import Folder, hold
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
 from ...store.keys import counted, stage_key
 from ...store.movie import Movie
@@ -69,16 +70,9 @@ def fit_movie(
     journal = Journal(journal_beside(path), key, dict.fromkeys(_COUNTS, ()))
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
-    for attempt in range(_ATTEMPTS):
-        summary, processors = _fit_shards(movie, path, journal, client, on_event)
-        try:
-            join(path, journal, client, on_event, attempt)
-            break
-        except DamagedPartError as error:
-            if attempt == _ATTEMPTS - 1:
-                raise
-            on_event(Warned(f"{error.what}: they are made again"))
-    results.finish(path, summary=summary, processors=sorted(processors))
+    with hold(Folder.at(path)):
+        summary, processors = _fit_whole(movie, path, journal, client, on_event)
+        results.finish(path, summary=summary, processors=sorted(processors))
     journal.remove()
     if len(mixed := widths(processors)) > 1:
         lanes = " and ".join(map(str, mixed))
@@ -87,6 +81,22 @@ def fit_movie(
         StageDone("fit", perf_counter() - started, summary=f"{summary['accepted']} of {summary['fits']} fits accepted")
     )
     return FitSummary(**summary)
+
+
+def _fit_whole(
+    movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink
+) -> tuple[dict[str, int], set[str]]:
+    """Fit and join all shards, those again that are found damaged then; return what :func:`_fit_shards` does."""
+    for attempt in range(_ATTEMPTS):
+        found = _fit_shards(movie, path, journal, client, on_event)
+        try:
+            join(path, journal, client, on_event, attempt)
+            break
+        except DamagedPartError as error:
+            if attempt == _ATTEMPTS - 1:
+                raise
+            on_event(Warned(f"{error.what}: they are made again"))
+    return found
 
 
 def _goes_on(path: Path, key: str, on_event: Sink) -> bool:
