@@ -24,7 +24,7 @@ STAGES = ("convert", "drift", "sum", "columns", "fit")
 REPORT = "report"
 """What a run makes after its stages."""
 
-_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
+_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from conftest import Scene
 
 from tract_dask.cluster.connect import connect
 from tract_dask.errors import DestinationError, TractError
-from tract_dask.progress import STAGES, ShardDone, StageDone, StageStarted
+from tract_dask.progress import STAGES, JsonLines, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.run import pipeline
 from tract_dask.service.data_root import DataRoot
 from tract_dask.service.deletion import delete_files
@@ -22,6 +22,7 @@ from tract_dask.service.outputs import Mark, claim, claimed, seal
 from tract_dask.settings import ClusterSettings, ConvertSettings, RunSettings
 from tract_dask.store import locks
 from tract_dask.store.files import remove, write_aside
+from tract_dask.store.held import is_held
 from tract_dask.store.journal import Journal
 from tract_dask.store.locks import sole_use
 from tract_dask.store.run_folder import RunFolder
@@ -191,6 +192,10 @@ def test_a_job_follows_no_link_in_its_folder(tmp_path):
     claim(root, mark)
     (tmp_path / "other.zarr").mkdir()
     (tmp_path / "run" / "movie.zarr").symlink_to(tmp_path / "other.zarr")
+    (tmp_path / "run" / "events.jsonl").symlink_to(tmp_path / "notes.txt")
     with claimed(root, mark), pytest.raises(DestinationError, match=REPLACED):
         write_aside(tmp_path / "run" / "movie.zarr" / "zarr.json", b"{}")
+    with claimed(root, mark):
+        JsonLines(tmp_path / "run" / "events.jsonl", is_held=is_held)(Warned("something"))
+    assert not (tmp_path / "notes.txt").exists()
     assert not any((tmp_path / "other.zarr").iterdir())

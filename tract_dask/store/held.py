@@ -141,9 +141,12 @@ def around(path: Path) -> list[Folder]:
 
 
 def is_held(path: Path) -> bool:
-    """Tell whether ``path`` lies where it did when work began; see :func:`check_held`."""
+    """Tell whether a file at ``path``, which may be added to, lies where it did when work began; see :func:`check_held`.
+
+    It is no new link either.
+    """
     try:
-        check_held(path)
+        check_held(path / "its end")
     except DestinationError:
         return False
     return True
