@@ -141,7 +141,7 @@ def around(path: Path) -> list[Folder]:
 
 
 def is_held(path: Path) -> bool:
-    """Tell whether a file at ``path``, which may be added to, lies where it did when work began; see :func:`check_held`.
+    """Tell whether a file at ``path``, which may be added to, lies where it did when work began, as :func:`check_held`.
 
     It is no new link either.
     """
