@@ -139,7 +139,7 @@ def track(counts: NDArray[Any], folder: Path, fit: dict[str, Any], columns: dict
     summed = td.sum_image(movie, drift)
     found = td.find_columns(summed, settings.columns)
     fit_movie(movie, prepare(movie, found, drift, settings.fit, summed=summed), places.results, on_event=events.append)
-    for dataset, path in ((drift, places.drift), (summed, places.sum)):
+    for dataset, path in ((drift, places.drift), (summed, places.sum), (found, places.columns.with_suffix(".zarr"))):
         datasets.write_dataset(without_unset(dataset), path)
     places.settings.write_text(to_toml(settings))
     places.events.write_text("".join(f"{json.dumps(to_record(event))}\n" for event in events))
@@ -220,8 +220,8 @@ def score(tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: 
     stated = tracks["stderr"].sel(parameter=["x", "y"]).transpose("frame", "column_id", "parameter").to_numpy()
     reference = np.stack([tracks["x_ref"].to_numpy(), tracks["y_ref"].to_numpy()], axis=1)
     still = scene.places - tracks["drift"].sel(axis=["x", "y"]).to_numpy()[:, None]
-    there = scene.amplitudes > 0
-    truth = np.stack([np.median(still[there[:, k], k], axis=0) for k in range(still.shape[1])])
+    there = scene.amplitudes != 0
+    truth = np.stack([np.median(still[there[:, k] | ~there[:, k].any(), k], axis=0) for k in range(still.shape[1])])
     limits = np.array(scene.shape[::-1]) - border
     inside = ((scene.places > border) & (scene.places < limits)).all(axis=(0, 2))
     distances, nearest = cKDTree(reference).query(truth)

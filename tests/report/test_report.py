@@ -23,7 +23,7 @@ from tract_dask.report.page import cards, is_current, write_report
 from tract_dask.report.survey import gathered, survey
 from tract_dask.service.api.results import _REPORT_POLICY
 from tract_dask.service.views import tracks as tracks_of_job
-from tract_dask.settings import FitSettings, RunSettings, to_toml
+from tract_dask.settings import ColumnSettings, FitSettings, RunSettings, to_toml
 from tract_dask.store import datasets, metadata, results, schema
 from tract_dask.store.schema import Status
 
@@ -78,6 +78,7 @@ class Run:
         self.folder, self.columns = folder, columns
         self.about = {"pixel_size_pm": PIXEL_PM, "frame_time_s": 0.1, "dose": 500.0} | about
         self.settings = RunSettings()
+        self.found = {"contrast": "bright", "contrast_rival": 0.01, "lattice_px": 30.0, "spacing_px": 30.0}
 
     def write(self):
         path = self.folder / "results.zarr"
@@ -97,6 +98,8 @@ class Run:
         )
         stored = {name: values for name, values in self.values.items() if name not in ("time", "drift_measured")}
         store_fits(path, stored, N_FRAMES)
+        found = self.columns.assign_attrs(self.found)
+        datasets.write_dataset(found, self.folder / "columns.zarr")
         summed = self.scene.summed()
         summed.attrs = {"pixel_size_pm": self.about["pixel_size_pm"]} if self.about["pixel_size_pm"] else {}
         datasets.write_dataset(summed, self.folder / "sum.zarr")
@@ -230,9 +233,30 @@ def _odd_column(run):
     run.columns["fit_ref"][1, 0] *= 0.5
 
 
+def _contrast_not_sure(run):
+    run.found["contrast_rival"] = 0.7
+
+
+def _doubtful(run):
+    run.columns["status_ref"][1:] = Status.AT_BOUND
+
+
+def _columns_too_far_apart(run):
+    run.found["lattice_px"] = 15.0
+
+
+def _columns_too_near(run):
+    run.settings = RunSettings(columns=ColumnSettings(spacing_px=15.0))
+    run.columns["status_ref"][::3] = Status.AT_BOUND
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
+        (_contrast_not_sure, {"contrast"}),
+        (_doubtful, {"doubtful_columns"}),
+        (_columns_too_far_apart, {"spacing"}),
+        (_columns_too_near, {"spacing"}),
         (_weak_column, {"weak_columns"}),
         (_few_accepted, {"accepted", "not_converged", "poor_frames"}),
         (_at_bound, {"at_bound", "poor_frames"}),

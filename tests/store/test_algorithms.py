@@ -49,7 +49,7 @@ def groups_of(settings: RunSettings) -> dict[str, Settings]:
         (("sum", "movie", {}, 1.0, NUMBERS), "fbfd7e26e3758c4a56d18b6c341a303c6d7f6df213a6c917b015eeb68e85878b"),
         (
             ("columns", NUMBERS, {"columns.contrast": "dark", "fit.window_px": 21.0}, b"x,y\n1,2\n"),
-            "808e8e9b0ba2cf31bfefdb191cc9a9164c41b1e5cf613eb9a055fdc186fe11c7",
+            "a537ee1fac878bab66363189edef3a96648a0a1ce88ab1824d0eb699f577decb",
         ),
         (
             ("fit", "movie", {}, NUMBERS, [1, 19, None, 10], ["Ce", "O"]),

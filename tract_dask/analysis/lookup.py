@@ -20,6 +20,7 @@ from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ..kernels.windows import cut_windows
 from ..settings.run import ColumnSettings, FitSettings
+from ..stages.columns.contrast import SIGNS
 from ..stages.columns.find import find_columns
 from ..stages.columns.window_size import neighbour_distance, resolve_window
 from ..store.columns import column_dataset, positions
@@ -72,7 +73,7 @@ def look_up_table(
     vacuum
         Intensity of a pixel of vacuum in the images.
     contrast
-        ``bright`` or ``dark`` columns.
+        ``bright`` or ``dark`` columns; ``auto``: those of which more can be fitted.
 
     Returns
     -------
@@ -107,10 +108,15 @@ def look_up_table(
         )
     spacing = None if settings.window_px else neighbour_distance(positions(scenes[0]))
     window_px = resolve_window(settings.window_px, pages.shape[1:], spacing)
-    fits = [_measured(page, scene, window_px, settings, contrast) for page, scene in zip(pages, scenes, strict=True)]
+    pairs = list(zip(pages, scenes, strict=True))
+    tries = [contrast] if contrast != "auto" else list(SIGNS)
+    measured = [
+        np.concatenate([_measured(page, scene, window_px, settings, own) for page, scene in pairs]) for own in tries
+    ]
+    fits = max(measured, key=lambda found: int(np.isfinite(found).all(axis=1).sum()))
     atoms = np.concatenate([_atoms(scene, k + 1) for k, scene in enumerate(scenes)])
     site = np.concatenate([scene["column_id"].to_numpy() for scene in scenes]).astype(str)
-    table = _values(np.concatenate(fits), atoms, site, size, window_px, settings)
+    table = _values(fits, atoms, site, size, window_px, settings)
     table.attrs = {
         "pixel_size_pm": size,
         "window_pm": window_px * size,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..store.schema import AXES
+from ..store.schema import AXES, Status
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -30,6 +30,12 @@ POOR_QUALITY = 0.5
 """A frame that correlates with the sum by less than this share of the usual is named."""
 RESIDUAL = 0.15
 """Residual of a fit on the summed image, as a share of the amplitude, that is worth a look."""
+RIVAL = 0.5
+"""Share of the support for one contrast that the other one may have."""
+DOUBTFUL, MANY_DOUBTFUL = 0.2, 0.5
+"""Share of the columns whose fits on the summed image may be flagged: where the spacing was given, and always."""
+SPACINGS = 0.6, 1.6
+"""Distance of the columns, in periods of the image, between which it may be."""
 _NAMED = 10
 
 
@@ -60,7 +66,7 @@ class Finding:
 
 def findings(run: Survey) -> list[Finding]:
     """Return what there is to know of a run, warnings first."""
-    checks = (_calibration, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
+    checks = (_calibration, _found, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
     found = [finding for check in checks for finding in check(run)]
     return sorted(found, key=lambda finding: not finding.serious)
 
@@ -103,6 +109,33 @@ def _calibration(run: Survey) -> Iterator[Finding]:
         yield Finding("frame_time", "The frame time is not known", text, remedy, serious=False)
 
 
+def _found(run: Survey) -> Iterator[Finding]:
+    """Tell where the columns themselves are in doubt: their contrast, their distance, or most of them."""
+    contrast, rival = run.found.get("contrast"), run.found.get("contrast_rival", 0.0)
+    if rival > RIVAL:
+        other = "dark" if contrast == "bright" else "bright"
+        text = f"The summed image speaks for {contrast} columns, and with {rival:.0%} of that for {other} ones."
+        remedy = f"Look at the columns in the summed image, and give --contrast {contrast} or --contrast {other}."
+        yield Finding("contrast", "Bright or dark columns is not sure", text, remedy)
+    status = run.tracks["status_ref"].to_numpy()
+    fitted = status[(status & int(Status.OUTSIDE_FRAME)) == 0]
+    doubtful = float((fitted != 0).mean()) if len(fitted) else 0.0
+    if doubtful > MANY_DOUBTFUL:
+        text = (
+            f"{int((fitted != 0).sum()):,} of {len(fitted):,} fits on the summed image are flagged: their amplitude is "
+            "within the noise, they did not settle, or their shape is that of no other column."
+        )
+        remedy = "Look at the columns in the summed image. Give --contrast, or --spacing-px, or the columns themselves."
+        yield Finding("doubtful_columns", "Most columns are in doubt", text, remedy)
+    period, apart = run.found.get("lattice_px"), run.found.get("spacing_px")
+    given = run.settings.columns.spacing_px if run.settings else None
+    too_near = period and given and given < SPACINGS[0] * period and doubtful > DOUBTFUL
+    if period and apart and (apart > SPACINGS[1] * period or too_near):
+        text = f"The columns are {apart:.3g} px apart, but the summed image repeats itself every {period:.3g} px."
+        remedy = "Leave --spacing-px unset, or give the distance between neighbours that the summed image shows."
+        yield Finding("spacing", "The distance between columns is not plausible", text, remedy)
+
+
 def _acceptance(run: Survey) -> Iterator[Finding]:
     if not run.fits or run.accepted >= LOW_SHARE * run.fits:
         return
@@ -134,7 +167,7 @@ def _columns(run: Survey) -> Iterator[Finding]:
     if never.any():
         text = f"The window of {_of_columns(ids[never])} leaves the image in every frame: nothing was fitted."
         remedy = "A smaller window (--window-px) reaches closer to the edge."
-        yield Finding("never_fitted", "Columns at the edge were not fitted", text, remedy)
+        yield Finding("never_fitted", "Columns at the edge were not fitted", text, remedy, serious=False)
     if sometimes.any():
         text = f"The window of {_of_columns(ids[sometimes])} leaves the image in some frames, as the specimen drifts."
         yield Finding("at_the_edge", "Columns near the edge are missing at times", text, serious=False)

@@ -58,6 +58,8 @@ class Survey:
         Median over columns of :func:`tract_dask.analysis.jumps.noise_factor`; NaN where no error is known.
     summed
         The summed image.
+    found
+        Attributes of the columns as they were found, see :func:`tract_dask.find_columns`; empty where they are gone.
     events
         The run's, as far as they are kept.
     """
@@ -72,6 +74,7 @@ class Survey:
     series: xr.Dataset
     factor: float
     summed: xr.Dataset
+    found: dict[str, Any]
     events: list[dict[str, Any]]
 
     @property
@@ -116,6 +119,7 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
         series=series,
         factor=float(np.median(noise_factor(measured)["factor"])) if np.isfinite(columns["expected"]).any() else np.nan,
         summed=summed,
+        found=_found(places.columns.with_suffix(".zarr")),
         events=events,
     )
 
@@ -226,6 +230,10 @@ def percentiles(values: Any) -> tuple[float, float]:
     """Return between which values nine tenths of the finite ones lie: their 5th and 95th percentile."""
     low, high = np.nanpercentile(values, [5, 95])
     return float(low), float(high)
+
+
+def _found(path: Path) -> dict[str, Any]:
+    return {str(name): value for name, value in datasets.open_dataset(path).attrs.items()} if path.exists() else {}
 
 
 def _settings(path: Path) -> RunSettings | None:

@@ -104,7 +104,10 @@ class ColumnSettings(Settings):
         None, "CSV file with columns x, y and optionally column_id, kind", grouped=True, common=True
     )
     contrast: str = setting(
-        "bright", "Columns are brighter or darker than their surroundings", choices=("bright", "dark"), common=True
+        "auto",
+        "Columns are brighter or darker than their surroundings; auto: what the summed image speaks for",
+        choices=("auto", "bright", "dark"),
+        common=True,
     )
     lattices: tuple[Any, ...] = setting(
         (),

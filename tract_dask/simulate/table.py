@@ -34,7 +34,7 @@ def tabulate(
     kind
         The columns to measure; without it, the heaviest.
     contrast
-        ``bright`` or ``dark`` columns.
+        ``bright`` or ``dark`` columns; ``auto``: those of which more can be fitted.
 
     Returns
     -------

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..settings.declare import Settings
 
-ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 1, "fit": 1}
+ALGORITHMS = {"convert": 1, "drift": 1, "sum": 1, "columns": 2, "fit": 1}
 """The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
 
 A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds
@@ -69,7 +69,7 @@ KEYED: dict[str, tuple[Keyed, ...]] = {
     "sum": (),
     "columns": (
         Keyed("columns.method", "auto"),
-        Keyed("columns.contrast", "bright"),
+        Keyed("columns.contrast", "auto"),
         Keyed("columns.lattices", ()),
         Keyed("columns.spacing_px", None),
         Keyed("columns.search_radius_px", None),

@@ -38,6 +38,7 @@ from ...store.journal import Payload
 from ...store.keys import stage_key
 from ...store.movie import Movie
 from ...store.shards import Shard
+from .contrast import SIGNS, chosen
 from .lattice import Mask, Places, Reals, Relief, binned, find_lattice, pixel_noise, relief
 from .window_size import default_window
 
@@ -143,7 +144,9 @@ def make_detector(image: Reals, valid: Mask, settings: ColumnSettings, *, blur_s
         raise SettingsError(
             "this method does not detect", "setting method (ColumnSettings)", " or ".join(METHODS), settings.method
         )
-    sign = 1 if settings.contrast == "bright" else -1
+    if settings.contrast == "auto":
+        settings = replace(settings, contrast=_clearer(image, valid, settings, blur_sigma_px))
+    sign = SIGNS[settings.contrast]
     spacing = settings.spacing_px
     if spacing is None:
         bright = sign * _filled(image, valid)
@@ -160,6 +163,17 @@ def make_detector(image: Reals, valid: Mask, settings: ColumnSettings, *, blur_s
     maxima = Detector("maxima", spacing, settings.detection_threshold, settings.min_amplitude, sign, blur_sigma_px)
     template = _template(image, valid, maxima, settings.template) if settings.method == "template" else None
     return replace(maxima, method=settings.method, template=template)
+
+
+def _clearer(image: Reals, valid: Mask, settings: ColumnSettings, blur_sigma_px: float) -> str:
+    """Return the contrast of which more stands out: by the squares of the maxima's strengths, without outlying ones."""
+    powers = dict.fromkeys(SIGNS, 0.0)
+    for contrast in SIGNS if valid.any() else ():
+        maxima = replace(settings, method="maxima", contrast=contrast)
+        strengths = make_detector(image, valid, maxima, blur_sigma_px=blur_sigma_px)(image, valid)[1]
+        if len(strengths):
+            powers[contrast] = float((np.minimum(strengths, 2 * np.median(strengths)) ** 2).sum())
+    return chosen(powers)[0]
 
 
 def _template(image: Reals, valid: Mask, maxima: Detector, at: tuple[int, ...] | None) -> Reals:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from ...settings.run import ColumnSettings
 from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv
 from ...store.schema import Status
+from .contrast import SIGNS, chosen, support
 from .detect import METHODS, make_detector
 from .lattice import Lattice, Places, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
 from .sites import lattice_sites
@@ -40,7 +41,7 @@ _FEWEST_FOR_SHAPE = 5
 class _Scene:
     """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``.
 
-    A pixel is a number of ``unit`` counts.
+    A pixel is a number of ``unit`` counts. ``lattices`` are those that were looked for, by the spacing that was given.
     """
 
     counts: NDArray[np.float64]
@@ -50,9 +51,18 @@ class _Scene:
     noise: float
     blur_sigma_px: float
     unit: float
+    lattices: dict[float | None, Lattice | None] = field(default_factory=dict)
+
+    @property
+    def dark(self) -> _Scene:
+        """The same for dark columns, with the same lattices: they do not depend on the contrast."""
+        return replace(self, image=-self.counts, sign=SIGNS["dark"])
 
     def lattice(self, spacing_px: float | None = None) -> Lattice | None:
-        return find_lattice(self.image, self.valid, self.noise, self.blur_sigma_px, spacing_px)
+        if spacing_px not in self.lattices:
+            found = find_lattice(self.image, self.valid, self.noise, self.blur_sigma_px, spacing_px)
+            self.lattices[spacing_px] = found
+        return self.lattices[spacing_px]
 
     def relief(self, spacing: float, precision_px: float = np.inf) -> Relief:
         return relief(self.image, self.valid, self.noise, spacing, self.blur_sigma_px, precision_px)
@@ -66,6 +76,20 @@ class _Seeds:
     kind: NDArray[np.str_]
     number: NDArray[np.int64]
     fixed: bool
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The columns of one contrast: seeds, refined places, and fits on the summed image in units of the scene."""
+
+    contrast: str
+    seeds: _Seeds
+    spacing: float
+    window_px: int
+    places: Places
+    fit: Places
+    status: NDArray[np.uint8]
+    support: float
 
 
 def find_columns(
@@ -88,7 +112,7 @@ def find_columns(
     summed
         From :func:`tract_dask.sum_image`.
     settings
-        Defaults to automatic columns, bright.
+        Defaults to automatic columns; with contrast ``auto`` both are tried, and the better one is taken.
     seeds
         Columns to start from, as :func:`lattice_columns` and :func:`read_columns_csv` return them and as you may have
         changed them; they take the place of the method, and keep their IDs. With a variable ``share``, as
@@ -104,10 +128,13 @@ def find_columns(
         row from the top and by x within a row (the columns no more than a third of the spacing below a row's first);
         those from a file or ``seeds`` keep their order and IDs. A column whose window leaves the exposed part of the
         image is kept where its seed was, with the flag outside_frame and without a fit. Attributes: spacing_px (median
-        distance to the nearest neighbour), window_px, contrast, blur_sigma_px, pixel_size_pm, n_seeds, and merged:
-        pairs of a column's ID and the number of a later seed that refined to the same column and was dropped. (A seed's
-        number is its ID, or its place in the list of seeds, from 1: automatic ones are listed strongest first, those of
-        lattices lattice by lattice, without the sites beyond the image.)
+        distance to the nearest neighbour), window_px, contrast (bright or dark), contrast_rival (the share of its
+        support that the other one has, see :mod:`tract_dask.stages.columns.contrast`; None where it was set),
+        lattice_px (shortest period of the image; None where it has none, and for columns that were given),
+        blur_sigma_px, pixel_size_pm, n_seeds, and merged: pairs of a column's ID and the number of a later seed that
+        refined to the same column and was dropped. (A seed's number is its ID, or its place in the list of seeds, from
+        1: automatic ones are listed strongest first, those of lattices lattice by lattice, without the sites beyond the
+        image.)
 
     Raises
     ------
@@ -118,30 +145,27 @@ def find_columns(
     """
     settings = settings or ColumnSettings()
     schema.validate(summed, schema.SUM, "summed image")
-    scene = _scene(summed, settings, blur_sigma_px)
-    found, spacing = _seeds(scene, settings, seeds)
-    window_px = resolve_window(window_px, scene.image.shape, spacing)
-    search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
-    centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
-    places = _refined(scene.relief(spacing, min(search / 6, centroid / 3)), found.places, search, centroid)
-    inside, corner = _corners(places, window_px, scene.valid)
-    places = np.where(inside[:, None], places, found.places)
-    fit, status = _fit(scene, places, corner, inside, found.kind, window_px, max(search, 1.0))
+    scene = _scene(summed, blur_sigma_px)
+    best, rival = _by_contrast(scene, settings, seeds, window_px)
+    fit, found = best.fit.copy(), best.seeds
     fit[:, [AMPLITUDE, BACKGROUND]] *= scene.unit
     if seeds is not None and "share" in seeds:
         fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
     fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
-    places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], places)
-    twins = _twins(places, _SAME * spacing)
+    places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], best.places)
+    twins = _twins(places, _SAME * best.spacing)
     kept = np.setdiff1d(np.arange(len(places)), list(twins))
-    kept = kept if found.fixed else kept[_reading_order(places[kept], spacing / 3)]
+    kept = kept if found.fixed else kept[_reading_order(places[kept], best.spacing / 3)]
     ids = found.number[kept] if found.fixed else np.arange(1, len(kept) + 1)
-    columns = column_dataset(places[kept], found.kind[kept].tolist(), ids, fit[kept], status[kept])
+    columns = column_dataset(places[kept], found.kind[kept].tolist(), ids, fit[kept], best.status[kept])
     name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
+    lattice = scene.lattice() if seeds is None and settings.method in ("auto", *METHODS) else None
     columns.attrs = {
-        "spacing_px": neighbour_distance(places[kept]) or spacing,
-        "window_px": window_px,
-        "contrast": settings.contrast,
+        "spacing_px": neighbour_distance(places[kept]) or best.spacing,
+        "window_px": best.window_px,
+        "contrast": best.contrast,
+        "contrast_rival": rival,
+        "lattice_px": lattice.spacing if lattice else None,
         "blur_sigma_px": float(blur_sigma_px),
         "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
         "n_seeds": len(found.number),
@@ -150,7 +174,45 @@ def find_columns(
     return columns
 
 
-def _scene(summed: xr.Dataset, settings: ColumnSettings, blur_sigma_px: float) -> _Scene:
+def _by_contrast(
+    scene: _Scene, settings: ColumnSettings, seeds: xr.Dataset | None, window_px: int | None
+) -> tuple[_Found, float | None]:
+    """Return the columns of the contrast that is set, or of the one with more support, and the share of the other one.
+
+    Where one contrast leads to no columns, the other is taken; the error is that of bright columns where both do not.
+    """
+    if settings.contrast != "auto":
+        own = scene if settings.contrast == "bright" else scene.dark
+        return _found(own, settings, seeds, window_px), None
+    found, errors = {}, []
+    for name, own in (("bright", scene), ("dark", scene.dark)):
+        try:
+            found[name] = _found(own, replace(settings, contrast=name), seeds, window_px)
+        except InputError as error:
+            errors.append(error)
+    if not found:
+        raise errors[0]
+    name, share = chosen({name: found[name].support if name in found else 0.0 for name in SIGNS})
+    return found.get(name, next(iter(found.values()))), share
+
+
+def _found(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None, window_px: int | None) -> _Found:
+    """Return the columns of one contrast."""
+    seeds, spacing = _seeds(scene, settings, given)
+    window_px = resolve_window(window_px, scene.image.shape, spacing)
+    search = spacing / 4 if settings.search_radius_px is None else settings.search_radius_px
+    centroid = max(2.0, spacing / 8) if settings.centroid_radius_px is None else settings.centroid_radius_px
+    places = _refined(scene.relief(spacing, min(search / 6, centroid / 3)), seeds.places, search, centroid)
+    inside, corner = _corners(places, window_px, scene.valid)
+    places = np.where(inside[:, None], places, seeds.places)
+    fit, status, explained = _fit(scene, places, corner, inside, seeds.kind, window_px, max(search, 1.0))
+    held = status == 0
+    known = next(iter(scene.lattices.values()), None)
+    held_by = support(scene.counts, places[held], fit[held], explained[held], spacing=spacing, lattice=known)
+    return _Found(settings.contrast, seeds, spacing, window_px, places, fit, status, held_by)
+
+
+def _scene(summed: xr.Dataset, blur_sigma_px: float) -> _Scene:
     counts = summed["image"].to_numpy().astype(np.float64, copy=False)
     valid = np.isfinite(counts) & (summed["exposure"].to_numpy() > 0)
     if not valid.any():
@@ -161,8 +223,7 @@ def _scene(summed: xr.Dataset, settings: ColumnSettings, blur_sigma_px: float) -
         counts = np.where(valid, counts, np.median(sample(counts[valid])))
     unit = unit_of(counts)
     counts = counts if unit == 1 else counts / unit
-    image, sign = (counts, 1) if settings.contrast == "bright" else (-counts, -1)
-    return _Scene(counts, image, valid, sign, pixel_noise(counts, valid), blur_sigma_px, unit)
+    return _Scene(counts, counts, valid, SIGNS["bright"], pixel_noise(counts, valid), blur_sigma_px, unit)
 
 
 def _refined(raised: Relief, places: Places, search: float, centroid: float) -> Places:
@@ -270,16 +331,17 @@ def _fit(
     kind: NDArray[np.str_],
     window_px: int,
     search: float,
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return (n, 7) fits, NaN where the window leaves the image, and (n,) flags.
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
+    """Return (n, 7) fits, NaN where the window leaves the image, (n,) flags, and R squared.
 
     What a first fit makes of a weak column may reach out to its neighbours. Where its shape is unusual for its kind, it
     is fitted again with about the usual one (mostly flagged at_bound), as the paper bounds fits by its columns' size.
     """
     fit = np.full((len(places), 7), np.nan)
     status = np.where(inside, 0, Status.OUTSIDE_FRAME).astype(np.uint8)
+    explained = np.zeros(len(places))
     if not inside.any():
-        return fit, status
+        return fit, status, explained
     x, y = corner[inside].T
     windows = cut_windows(scene.counts[None], y[None], x[None], window_px, scene.blur_sigma_px)[0]
     start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
@@ -288,16 +350,16 @@ def _fit(
     odd = _odd_shapes(fits, kind[inside], start, lower, upper)
     if odd.any():
         again = fit_gaussians(windows[odd], start[odd], lower[odd], upper[odd], **options)
-        for name in ("estimates", "status"):
+        for name in ("estimates", "status", "r_squared"):
             getattr(fits, name)[odd] = getattr(again, name)
-    fit[inside] = fits.estimates
+    fit[inside], explained[inside] = fits.estimates, fits.r_squared
     fit[inside, X] += x
     fit[inside, Y] += y
     weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.noise * damping(scene.blur_sigma_px))
     flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: ~fits.converged, Status.AT_BOUND: fits.at_bound}
     for flag, found in flags.items():
         status[inside] |= np.where(found, flag, Status.OK).astype(np.uint8)
-    return fit, status
+    return fit, status, explained
 
 
 def _odd_shapes(

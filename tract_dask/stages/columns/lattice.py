@@ -39,6 +39,8 @@ _MARGIN = 3
 """The shortest shift, px, that may be a lattice vector."""
 _COARSE = 16
 """Smoothing by so many px or more is done on bins of a sixteenth of it."""
+_LEVEL_BINS = 8
+"""Bins in the reach of the background's median."""
 _SAMPLE = 1 << 20
 """Of more values than these, statistics are taken from a sample."""
 _STRONG = 0.5
@@ -187,13 +189,14 @@ def sample(values: Reals) -> Reals:
 def _autocorrelation(image: Reals, valid: Mask, noise: float) -> tuple[Reals, Places]:
     """Return the heights and shifts (x, y) of the maxima of an image's autocorrelation, one of each opposite pair.
 
-    The image is freed of its slow background and of outliers. Its autocorrelation is divided by that of its envelope
+    The image is freed of its slow background and of outliers. The background is a median: a mean would leave a ridge
+    along the rim of the specimen, which outweighs low columns. Its autocorrelation is divided by that of its envelope
     (the local rms contrast, less the noise), so that a perfect lattice reaches about 1 however thick the crystal, and
     however much of the image is vacuum; and multiplied by the square root of the envelopes' overlap, so that a long
     shift must be better than a short one. None where the noise outweighs the columns.
     """
     wide = min(image.shape) / 8
-    flat = np.where(valid, image - smooth(image, wide), np.float32(0))
+    flat = np.where(valid, image - _level(image, wide), np.float32(0))
     flat = np.clip(flat, *np.percentile(sample(flat[valid]), [0.5, 99.5]).astype(np.float32)) * valid
     correlation = _correlate(flat)
     step = _coarseness(wide)
@@ -245,6 +248,13 @@ def smooth(image: Reals, sigma: float) -> Reals:
     for _ in range(3):
         bins = box_means(bins, radius)
     return bins if step == 1 else expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
+
+
+def _level(image: Reals, reach: float) -> Reals:
+    """Return the median of an image's surroundings, those within ``reach`` px along each axis, from bins."""
+    step = max(1, int(reach / _LEVEL_BINS))
+    bins = ndimage.median_filter(binned(image, step), 2 * round(reach / step) + 1, mode="nearest")
+    return expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
 
 
 def _coarseness(sigma: float) -> int:

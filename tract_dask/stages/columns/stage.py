@@ -226,6 +226,7 @@ def _columns_summary(columns: xr.Dataset) -> str:
     merged = len(columns.attrs.get("merged", ()))
     parts = (
         f"{columns.sizes['column_id']} columns",
+        f"{columns.attrs['contrast']}, as the image says" if "contrast_rival" in columns.attrs else "",
         f"{outside} outside the frame" if outside else "",
         f"{merged} seeds merged" if merged else "",
     )

@@ -43,7 +43,7 @@ const CHOICES = {
   "fit.intensity_scale": { paper: "Box (0.9111)", ellipse: "Ellipse (0.8647)" },
   "drift.method": { auto: "Measure", csv: "From a CSV file", none: "None" },
   "columns.method": { auto: "Automatic", lattice: "Lattices", csv: "From a CSV file", maxima: "Maxima", blobs: "Blobs", template: "Template" },
-  "columns.contrast": { bright: "Bright", dark: "Dark" },
+  "columns.contrast": { auto: "Bright or dark, as the image says", bright: "Bright", dark: "Dark" },
 };
 
 /** Names in words, where the declared name with spaces would not do. */
