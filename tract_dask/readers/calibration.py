@@ -25,8 +25,25 @@ def calibrated(axes: Sequence[Axis], order: Order, where: str) -> SourceMetadata
         notes = (f"{where}: its pixels have the size {sides[0].scale:g} without a unit; the pixel size is not known",)
     elif pixel is None and (unit := sides[0].unit) and not to_pm(1.0, unit) and unit.lower() not in _NO_UNITS:
         notes = (f"{where}: its pixels are measured in {unit}, which is not a length; the pixel size is not known",)
+    notes += _contradicting(sides, where) if pixel is not None else ()
     times = SourceMetadata() if order.frame is None else _times(axes[order.frame], where)
     return replace(times, pixel_size_pm=pixel, notes=(*notes, *times.notes))
+
+
+_UNEVEN = 0.01
+
+
+def _contradicting(sides: Sequence[Axis], where: str) -> tuple[str, ...]:
+    """Return notes on the axes x and y where one is no length but the other is, or their places are not even."""
+    notes = []
+    for side in sides:
+        unit = side.unit.lower()
+        if not to_pm(1.0, side.unit) and unit not in _NO_UNITS:
+            notes.append(f"{where}: its axis {side} is not a length; the pixel size is that of the other axis")
+        steps = np.diff(side.values) if side.values is not None else np.zeros(0)
+        if len(steps) and np.ptp(steps) > _UNEVEN * abs(np.median(steps)):
+            notes.append(f"{where}: its places along {side} are not even; the usual (median) step is used")
+    return tuple(notes)
 
 
 _NO_UNITS = ("", "px", "pixel", "pixels", "<undefined>", "undefined", "none", "n/a", "index", "arb", "a.u.")

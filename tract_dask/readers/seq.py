@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..errors import SourceError
 from ..settings.run import SourceSettings
 from .blocks import BlockSource, checked_records, read_records
-from .checks import Permit, checked_shape, is_named, open_binary, truncated
+from .checks import Permit, checked_file, checked_shape, is_named, open_binary, reading, truncated
+from .mrc import open_mrc
 from .source import SourceMetadata
 from .times import timed_ticks
 
@@ -64,13 +65,14 @@ def open_seq(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
     if known.frame_time_s is None and math.isfinite(header.rate) and 1e-6 < header.rate < 1e9:
         notes += (f"{path.name}: the frame time is that of the set rate, {header.rate:.6g} frames a second",)
         known = replace(known, frame_time_s=float(f"{1 / header.rate:.9g}"))
+    references, odd = _references(path, (header.n_y, header.n_x), permit)
     return BlockSource(
         path=str(path),
         files=(path,),
         format=f"StreamPix {header.version}",
         shape=(n_frames, header.n_y, header.n_x),
         dtype=header.stored.newbyteorder("="),
-        metadata=replace(known, notes=notes + known.notes, references=_references(path)),
+        metadata=replace(known, notes=(*notes, *known.notes, *odd), references=references),
         offsets=offsets,
         stored=header.stored,
     )
@@ -200,12 +202,33 @@ def _times(path: Path, header: _Header, offsets: NDArray[np.int64]) -> SourceMet
     return timed_ticks(since, 1_000_000, path.name)
 
 
-def _references(path: Path) -> dict[str, Path]:
-    """Return the files of the detector beside a sequence: ``NAME.dark.mrc``, ``NAME.seq.dark.mrc`` and the like."""
-    found = {}
+def _references(path: Path, shape: tuple[int, int], permit: Permit | None) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Return the files of the detector beside a sequence: ``NAME.dark.mrc``, ``NAME.seq.dark.mrc`` and the like.
+
+    One that cannot be a reference of frames with this ``shape`` is left out; there is a note.
+    """
+    found, notes = {}, []
     for what, endings in _BESIDE.items():
         names = (path.with_name(f"{stem}{ending}") for ending in endings for stem in (path.stem, path.name))
         there = next((file for file in names if is_named(file)), None)
-        if there is not None:
+        if there is None:
+            continue
+        is_free = permit is None or not there.is_symlink()  # a link is named, not followed
+        if there.suffix.lower() == ".mrc" and is_free and (wrong := _unfit(there, shape, permit)):
+            notes.append(f"{there.name} next to the movie is by its name the detector's {what} reference, but {wrong}")
+        else:
             found[what] = there
-    return found
+    return found, tuple(notes)
+
+
+def _unfit(file: Path, shape: tuple[int, int], permit: Permit | None) -> str:
+    """Return why an MRC file cannot be a reference of frames with a shape (y, x); empty where it can."""
+    try:
+        checked_file(file, permit)
+        with reading(str(file)):
+            found = open_mrc(file, "", SourceSettings(), permit).shape
+    except SourceError as error:
+        return f"it cannot be read ({error.what})"
+    if found[1:] == shape:
+        return ""
+    return f"it has {found[1]} x {found[2]} pixels, and the frames {shape[0]} x {shape[1]}"

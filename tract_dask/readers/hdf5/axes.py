@@ -31,18 +31,24 @@ def axes_of(dataset: Any, where: str, file: Any) -> tuple[list[Axis], tuple[str,
 
     ``file`` is that which the user named: groups of it may link to the data set, and name its axes.
     """
+    odd: list[str] = []
     try:
-        for known in (_velox, _hyperspy, _emd, _nexus, partial(_linked, file=file), _scales):
+        nexus = partial(_nexus, odd=odd), partial(_linked, file=file, odd=odd)
+        for known in (_velox, _hyperspy, _emd, *nexus, _scales):
             if axes := known(dataset):
-                return [_of_length(axis, length) for axis, length in zip(axes, dataset.shape, strict=True)], ()
+                fitting = [_of_length(axis, length, odd) for axis, length in zip(axes, dataset.shape, strict=True)]
+                return fitting, tuple(f"{where}: {one}" for one in odd)
     except DAMAGE as error:
         return [Axis()] * dataset.ndim, (f"{where}: its axes cannot be read ({words(error)})",)
     return [Axis()] * dataset.ndim, ()
 
 
-def _of_length(axis: Axis, length: int) -> Axis:
+def _of_length(axis: Axis, length: int, odd: list[str]) -> Axis:
     """Return an axis without its places where they are not one for each element: EMD may list two, NeXus the edges."""
-    return axis if axis.values is None or len(axis.values) == length else replace(axis, values=None)
+    count = length if axis.values is None else len(axis.values)
+    if count not in (1, 2, length, length + 1):
+        odd.append(f"its axis {axis} lists {count:,} places for {length:,} elements; only their step is used")
+    return axis if count == length else replace(axis, values=None)
 
 
 def single(item: Any, name: str) -> Any:
@@ -129,31 +135,53 @@ def _listed(item: Any, name: str) -> Axis:
     return Axis(text(single(item, name)), text(single(item, "units")), step, values=values)
 
 
-def _nexus(dataset: Any) -> list[Axis]:
+def _nexus(dataset: Any, odd: list[str]) -> list[Axis]:
     group, short = dataset.parent, (dataset.name or "").rpartition("/")[2]
     is_signal = text(single(group, "signal")) == short and "axes" in group.attrs
-    return _by_nexus(dataset, group, group if is_signal else dataset)
+    return _by_nexus(dataset, group, group if is_signal else dataset, odd)
 
 
-def _by_nexus(dataset: Any, group: Any, holder: Any) -> list[Axis]:
-    """Return the axes that an attribute of ``holder`` names, and a group has."""
+def _by_nexus(dataset: Any, group: Any, holder: Any, odd: list[str]) -> list[Axis]:
+    """Return the axes that an attribute of ``holder`` names and a group has; what is odd of them goes to ``odd``."""
     if "axes" not in holder.attrs:
         return []
     names = [text(name) for name in np.atleast_1d(holder.attrs["axes"])]
     if len(names) == 1:
         names = [name for name in re.split(r"[\s:,\[\]]+", names[0]) if name]
-    places = {_place(group, name, k): name for k, name in enumerate(names)}
-    return [_nexus_axis(group, places.get(k, ".")) for k in range(dataset.ndim)]
+    first = _first_of(names, group, dataset, odd)
+    places = [_place(group, name, k + first) for k, name in enumerate(names)]
+    named = [name for name in names if name != "."]
+    if len({*places} & {*range(dataset.ndim)}) < len(names) or len({*named}) < len(named):
+        odd.append(f"its axes ({', '.join(names)}) contradict each other or its {dataset.ndim} axes, and are not used")
+        return [Axis()] * dataset.ndim
+    known = dict(zip(places, names, strict=True))
+    return [_nexus_axis(group, known.get(k, ".")) for k in range(dataset.ndim)]
 
 
-def _linked(dataset: Any, file: Any) -> list[Axis]:
+def _first_of(names: list[str], group: Any, dataset: Any, odd: list[str]) -> int:
+    """Return which axis the first of fewer names than axes is of, by the lengths of what is listed; there is a note."""
+    fewer = dataset.ndim - len(names)
+    if fewer <= 0 or any(f"{name}_indices" in group.attrs for name in names):
+        return 0
+    lengths = [None if item is None else item.size for item in (within(group, name, h5py.Dataset) for name in names)]
+    for first in (0, fewer):
+        shape = dataset.shape[first : first + len(names)]
+        pairs = list(zip(lengths, shape, strict=True))
+        if any(lengths) and all(one in (None, length, length + 1) for one, length in pairs):
+            side = "first" if not first else "last"
+            odd.append(f"it names {len(names)} of its {dataset.ndim} axes ({', '.join(names)}), taken for its {side}")
+            return first
+    return len(dataset.shape)  # none fits
+
+
+def _linked(dataset: Any, file: Any, odd: list[str]) -> list[Axis]:
     """Return the axes by a group of NeXus whose signal is a link to the data set."""
     waiting, looked = deque([file["/"]]), 0
     while waiting and looked < _MOST_GROUPS:
         group = waiting.popleft()
         signal = text(single(group, "signal"))
         if signal and _leads_to(group, signal, dataset):
-            return _by_nexus(dataset, group, group)
+            return _by_nexus(dataset, group, group, odd)
         for name in islice(group, _MOST_GROUPS):
             looked += 1
             if isinstance(item := _member(group, name), h5py.Group) and item.name.count("/") < _DEEPEST:

@@ -39,16 +39,26 @@ def movies_of(found: list[Found]) -> list[Found]:
     return deep[0] or (flat[0] + deep[1]) or more or thin or flat[1]
 
 
+_SMALL = 16
+"""Sides of images that are smaller are those of tables of results rather than of movies."""
+
+
 def others_of(movie: Found, found: list[Found], where: str) -> tuple[str, ...]:
     """Return a note on what lies beside the movie that was chosen and could be a movie, or a reference of its size."""
     sides = [length for length in movie.shape if length > 1][-2:]
     numbers = (item for item in found if item.dtype.kind in "iufcb" and item.shown != movie.shown)
-    others = [item for item in numbers if len(item.shape) > 2 or sorted(item.shape) == sorted(sides)]
+    others = [item for item in numbers if item.signal or _is_image(item.shape, sides)]
     if not others:
         return ()
     shown = ", ".join(f"{item.shown} {item.shape}{item.label}" for item in others[:5])
     more = f" and {len(others) - 5} more" if len(others) > 5 else ""
     return (f"{where}: {movie.shown} is read; the file also holds {shown}{more}",)
+
+
+def _is_image(shape: tuple[int, ...], sides: list[int]) -> bool:
+    """Tell whether a shape is that of images with these sides, or of a movie of others."""
+    same = sorted(length for length in shape if length in sides)[-2:] == sorted(sides)
+    return (same and len(shape) > 1) or (len(shape) > 2 and sorted(shape)[-2] >= _SMALL)
 
 
 def ambiguous(

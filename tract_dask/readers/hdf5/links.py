@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from ...errors import MissingSourceError, SourceError
 from ..checks import DAMAGE, MOST_FRAMES, Permit, checked_file, reading, truncated, words
@@ -262,6 +263,7 @@ def _behind(dataset: Any, access: Access, behind: Behind, depth: int, frames: ra
                 source = _virtual_source(dataset, *names, extent, access, stack, optional=block > 0)
                 if source is None:
                     break
+                behind.notes.extend(_converted(source, dataset))
                 _behind(source, access, behind, depth + 1, span if depth == 0 else frames)
 
 
@@ -326,7 +328,8 @@ def _virtual_source(
     if source is None and optional:
         return None
     found = source.shape if isinstance(source, h5py.Dataset) else ()
-    if not found or len(found) < len(extent) or any(has < needs for has, needs in zip(found, extent, strict=False)):
+    has, needs = (found, extent) if len(found) == len(extent) else map(_longer_than_1, (found, extent))
+    if not found or len(has) < len(needs) or any(one < other for one, other in zip(has, needs, strict=False)):
         raise SourceError(
             f"a source of the virtual data set is {'too short' if found else 'missing'}",
             f"{holder}::{dataset.name}",
@@ -335,6 +338,20 @@ def _virtual_source(
             "Copy that file again, or write the movie again",
         )
     return source
+
+
+def _longer_than_1(lengths: tuple[int, ...]) -> tuple[int, ...]:
+    """Return lengths without those of 1: a frame of a movie may be a whole image with two axes."""
+    return tuple(length for length in lengths if length > 1)
+
+
+def _converted(source: Any, dataset: Any) -> list[str]:
+    """Return a note where a virtual data set is of a type that cannot hold all values of a source."""
+    if np.can_cast(source.dtype, dataset.dtype, "safe"):
+        return []
+    where = f"{dataset.file.filename}::{dataset.name}"
+    change = f"{source.dtype} to {dataset.dtype}, which cannot hold all of them"
+    return [f"{where}: values of {Path(source.file.filename).name}::{source.name} are converted from {change}"]
 
 
 def _segment(dataset: Any, name: str, offset: int, size: int, access: Access, *, virtual: bool) -> Segment:

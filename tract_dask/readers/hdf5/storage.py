@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +75,17 @@ _PARTLY = "{}: {:,} of {:,} chunks were never written; their pixels are read as 
 
 def _uncovered(dataset: Any, properties: Any, where: str) -> tuple[str, ...]:
     """Return a note where the sources of a virtual data set give fewer pixels than it has."""
-    covered = 0
+    joined = h5py.h5s.create_simple(dataset.shape)
+    joined.select_none()
     for number in range(properties.get_virtual_count()):
         space = properties.get_virtual_vspace(number)
         if space.get_select_type() != h5py.h5s.SEL_HYPERSLABS:
             return ()
         if space.is_regular_hyperslab() and h5py.h5s.UNLIMITED in sum(space.get_regular_hyperslab()[2:], ()):
             return ()  # as many as the sources have
-        covered += space.get_select_npoints()
+        for block in _blocks(space):
+            joined.select_hyperslab(*block, op=h5py.h5s.SELECT_OR)  # sources may overlap
+    covered = joined.get_select_npoints()
     if covered >= (n_pixels := math.prod(dataset.shape)):
         return ()
     if not covered:
@@ -90,6 +94,17 @@ def _uncovered(dataset: Any, properties: Any, where: str) -> tuple[str, ...]:
         f"{where}: {n_pixels - covered:,} of {n_pixels:,} pixels of the virtual data set come from no file; they are"
         " read as the fill value",
     )
+
+
+def _blocks(space: Any) -> Iterator[tuple[tuple[int, ...], ...]]:
+    """Yield start, count, stride and block of the regular parts of a selection."""
+    if space.is_regular_hyperslab():
+        start, stride, count, block = space.get_regular_hyperslab()
+        yield start, count, stride, block
+        return
+    for first, last in space.get_select_hyper_blocklist():
+        ones = (1,) * len(first)
+        yield tuple(map(int, first)), ones, ones, tuple(int(b) - int(a) + 1 for a, b in zip(first, last, strict=True))
 
 
 def _check_chunks(dataset: Any, size: int, where: str) -> None:
