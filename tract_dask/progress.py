@@ -78,6 +78,16 @@ class Warned:
     message: str
 
 
+@dataclass(frozen=True)
+class Noticed:
+    """A warning about the tracks of a finished run, see :mod:`tract_dask.report.findings`."""
+
+    name: str
+    title: str
+    text: str
+    remedy: str = ""
+
+
 class RunState(StrEnum):
     """How a run ended."""
 
@@ -99,7 +109,7 @@ class RunDone:
     message: str = ""
 
 
-Event: TypeAlias = RunStarted | StageStarted | ShardDone | StageDone | Warned | RunDone
+Event: TypeAlias = RunStarted | StageStarted | ShardDone | StageDone | Warned | Noticed | RunDone
 
 Sink: TypeAlias = Callable[[Event], None]
 

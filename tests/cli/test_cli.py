@@ -21,7 +21,7 @@ from tract_dask.cli import main as cli
 from tract_dask.cli import options
 from tract_dask.cli.terminal import Terminal
 from tract_dask.errors import ClusterError
-from tract_dask.progress import RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
+from tract_dask.progress import Noticed, RunDone, RunStarted, ShardDone, StageDone, StageStarted, Warned
 from tract_dask.run import pipeline, session
 from tract_dask.run import plan as run_plan
 from tract_dask.settings import RunSettings, declare, to_toml
@@ -341,8 +341,10 @@ def test_progress_shows_what_is_done_and_how_fast(terminal):
         show(Warned("look at this"))
         console.print(show.table())
         show(StageDone("fit", 20.0, summary="3900 of 4000 fits accepted"))
+        show(Noticed("contrast", "Bright or dark is not sure", "It speaks for both.", "Give --contrast dark."))
         show(RunDone("done_with_bad_frames", 75.0))
     text = file.getvalue()
+    assert "! Bright or dark is not sure. It speaks for both.\n  → Give --contrast dark.\n" in text
     assert text.count("movie.tif → out") == 1
     assert "dashboard http://127.0.0.1:8787/status" in text
     assert "200/600 frames" in text

@@ -19,6 +19,7 @@ from tract_dask.report import page
 from tract_dask.report import survey as survey_module
 from tract_dask.report.findings import findings
 from tract_dask.report.interactive import quantised, script_json
+from tract_dask.report.look import look
 from tract_dask.report.page import cards, is_current, write_report
 from tract_dask.report.survey import gathered, survey
 from tract_dask.service.api.results import _REPORT_POLICY
@@ -681,3 +682,24 @@ def test_every_setting_is_on_the_page():
     }
     assert {row["name"] for group in rows.values() for row in group} == names
     assert not any(row["changed"] for group in rows.values() for row in group)
+
+
+def test_a_look_keeps_what_it_found_with_the_tracks(run, monkeypatch):
+    _weak_column(run)
+    found, known = look(run.write(), page=False)
+    assert not known
+    assert "weak_columns" in {finding.name for finding in found}
+    assert not (run.folder / "report.html").exists()
+    assert results.open_results(run.folder / "results.zarr").attrs["findings"] == "weak_columns"
+    monkeypatch.setattr("tract_dask.report.look.survey", None)  # what is known is not measured again
+    assert look(run.folder, page=False) == (found, True)
+
+
+def test_a_look_writes_the_page_once(run):
+    assert look(run.write())[1] is False
+    assert is_current(run.folder)
+    assert look(run.folder)[1] is True
+    assert results.open_results(run.folder / "results.zarr").attrs["findings"] == "none"
+    run.settings = RunSettings(columns=ColumnSettings(spacing_px=15.0))
+    (run.folder / "run.toml").write_text(to_toml(run.settings))
+    assert look(run.folder)[1] is False

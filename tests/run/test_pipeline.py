@@ -97,7 +97,7 @@ def test_run_writes_everything_and_finds_the_scene(job, scene):
 
 
 def test_a_report_that_fails_is_a_warning_of_a_finished_run(done, monkeypatch):
-    monkeypatch.setattr("tract_dask.report.page.write_report", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("tract_dask.report.look.write_page", lambda *_, **__: 1 / 0)
     assert done(report=True).state == "done"
     assert "division by zero" in done.of(Warned)[0].message
     assert not (done.output / "report.html").exists()

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from ..progress import (
     Event,
+    Noticed,
     RunDone,
     RunStarted,
     RunState,
@@ -78,6 +79,7 @@ class Terminal:
         self.console = console or Console(stderr=True, highlight=False)
         self.lines: dict[str, Line] = {}
         self._printed, self._headed = monotonic(), False
+        self._noticed: list[Noticed] = []
         live = self.console.is_terminal and not self.console.is_dumb_terminal
         self._live = Live(get_renderable=self.table, console=self.console, refresh_per_second=4) if live else None
 
@@ -117,6 +119,8 @@ class Terminal:
                 self._plain(f"{line.stage}: " + ", ".join(filter(None, (took, line.speed, line.summary))))
             case Warned():
                 self._say(f"warning: {event.message}", "yellow")
+            case Noticed():
+                self._noticed.append(event)
             case RunDone():
                 self._end(event)
 
@@ -156,6 +160,11 @@ class Terminal:
         if self._live:
             self._live.refresh()
             self._live.stop()
+        for finding in self._noticed:
+            self._say(f"! {finding.title}. {finding.text}", "yellow")
+            if finding.remedy:
+                self._say(f"  → {finding.remedy}", "yellow")
+        self._noticed.clear()
         message = event.message or _ENDS.get(event.state, event.state)
         styles: dict[str, str] = {RunState.DONE: "green", RunState.FAILED: "red"}
         self._say(f"{message} ({clock(event.seconds)})", styles.get(event.state, "yellow"))

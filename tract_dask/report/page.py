@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -23,7 +22,6 @@ from ..errors import TractError
 from ..settings.declare import Settings
 from ..settings.run import RunSettings
 from ..store import files, metadata
-from ..store.files import read_small
 from ..store.keys import digest_of
 from ..store.results import part_in_words
 from ..store.run_folder import RunFolder
@@ -32,9 +30,7 @@ from ..web.bundle import STATIC
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import figure_data, windows_data
-from .survey import Survey, median, percentiles, residuals, survey
-
-_EVENTS_BYTES = 256 << 20
+from .survey import Survey, events_of, median, percentiles, residuals, survey
 
 _SCRIPT = Path(__file__).parent / "page.js"
 KEY = '<meta name="tract-dask-key" content="'
@@ -82,35 +78,29 @@ def write_report(folder: str | Path, path: str | Path | None = None, *, figures:
     """
     folder = Path(folder)
     place = RunFolder(folder).report if path is None else Path(path)
-    run = survey(folder, _events(RunFolder(folder).events))
-    files.write_aside(place, render(run, _key(folder), figures=figures).encode(errors="backslashreplace"))
+    write_page(survey(folder, events_of(RunFolder(folder).events)), run_key(folder), place, figures=figures)
     return place
+
+
+def write_page(run: Survey, key: str, place: Path, *, figures: bool) -> None:
+    """Write the page of a run that was looked at; ``key`` is that of :func:`run_key`."""
+    files.write_aside(place, render(run, key, figures=figures).encode(errors="backslashreplace"))
 
 
 def is_current(folder: Path) -> bool:
     """Tell whether the folder's report is of the tracks that are in it now."""
     try:
         with RunFolder(folder).report.open(encoding="utf-8") as file:
-            return f"{KEY}{_key(folder)}" in file.read(2000)
+            return f"{KEY}{run_key(folder)}" in file.read(2000)
     except OSError:
         return False
 
 
-def _key(folder: Path) -> str:
-    """Return the key of a report: all that the tracks say of themselves, and the settings of the run."""
-    about = json.dumps(metadata.attributes(RunFolder(folder).results), sort_keys=True)
+def run_key(folder: Path) -> str:
+    """Return the key of what is said of a run: all that the tracks say of themselves, and the settings of the run."""
+    about = {k: v for k, v in metadata.attributes(RunFolder(folder).results).items() if k != "findings"}
     settings = RunFolder(folder).settings
-    return digest_of(about, settings.read_bytes() if settings.exists() else b"")
-
-
-def _events(path: Path) -> list[dict[str, Any]]:
-    """Return the events of a run; a line that is not whole is left out, and all are where they cannot be read."""
-    found = []
-    with suppress(OSError):
-        for line in read_small(path, _EVENTS_BYTES).splitlines():
-            with suppress(ValueError, RecursionError):
-                found.append(json.loads(line))
-    return [event for event in found if isinstance(event, dict) and "event" in event]
+    return digest_of(json.dumps(about, sort_keys=True), settings.read_bytes() if settings.exists() else b"")
 
 
 def render(run: Survey, key: str = "", *, figures: bool = True) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from ..kernels.windows import blur
 from ..settings.run import RunSettings
 from ..settings.toml import load
 from ..store import datasets, metadata, results, schema
+from ..store.files import read_small
 from ..store.run_folder import RunFolder
 
 VALUES = 1_600_000
@@ -28,6 +31,7 @@ _IN_MEMORY = 256 << 20
 """Tracks of no more bytes are read once; larger ones are gone through part by part, more than once."""
 _PART_BYTES = 16 << 20
 """So many bytes of fits are looked at together, or those of a bin of frames."""
+_EVENTS_BYTES = 256 << 20
 _FRAMES = 2000
 """Points that a curve over the frames may have."""
 
@@ -122,6 +126,16 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
         found=_found(places.columns.with_suffix(".zarr")),
         events=events,
     )
+
+
+def events_of(path: Path) -> list[dict[str, Any]]:
+    """Return the events of a run; a line that is not whole is left out, and all are where they cannot be read."""
+    found = []
+    with suppress(OSError):
+        for line in read_small(path, _EVENTS_BYTES).splitlines():
+            with suppress(ValueError, RecursionError):
+                found.append(json.loads(line))
+    return [event for event in found if isinstance(event, dict) and "event" in event]
 
 
 def gathered(tracks: xr.Dataset, opened: Callable[[str], Any] | None, values: int = VALUES) -> tuple[xr.Dataset, ...]:

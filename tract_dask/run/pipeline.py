@@ -15,7 +15,7 @@ import xarray as xr
 from distributed import Client
 
 from ..cluster.retries import persist
-from ..progress import REPORT, JsonLines, RunState, Sink, StageDone, StageStarted, Warned, silent, tee
+from ..progress import REPORT, JsonLines, Noticed, RunState, Sink, StageDone, StageStarted, Warned, silent, tee
 from ..readers.checks import Permit
 from ..readers.movie_files import FileList
 from ..readers.source import FrameSource
@@ -50,6 +50,8 @@ class RunOutcome:
         Time of every stage that worked, in s.
     reused
         Stages that an earlier run had finished.
+    findings
+        Names of the warnings about the tracks, see :mod:`tract_dask.report.findings`.
     """
 
     outputs: RunFolder
@@ -62,10 +64,15 @@ class RunOutcome:
     bad_frames: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     reused: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
 
     def to_record(self) -> dict[str, Any]:
         """Return the outcome as a JSON-ready mapping."""
-        return dataclasses.asdict(self) | {"outputs": self.outputs.paths(), "reused": list(self.reused)}
+        return dataclasses.asdict(self) | {
+            "outputs": self.outputs.paths(),
+            "reused": list(self.reused),
+            "findings": list(self.findings),
+        }
 
 
 def run(
@@ -106,7 +113,8 @@ def run(
     plan_only
         Only plan, and write nothing.
     report
-        Write ``report.html`` at the end, where it is not there yet or of other tracks.
+        Write ``report.html`` at the end, where it is not there yet or of other tracks. Without it the tracks are looked
+        at all the same, and ``on_event`` takes what speaks against them (:class:`tract_dask.progress.Noticed`).
     until
         The stage to stop after, one of :data:`tract_dask.progress.STAGES`; the same call without it goes on. After
         ``columns``, the table can be edited first.
@@ -170,8 +178,7 @@ def _run(
             session.attempt(partial(_complete_toml, outputs, settings, made.movie, made.columns))
             session.state = RunState.DONE_WITH_BAD_FRAMES if made.summary.bad_frames else RunState.DONE
             session.message = "" if record.seconds else "all was done before: nothing to do"
-            if report:
-                _report(outputs, session)
+            made.findings = _look(outputs, session, page=report)
     summary = made.summary or FitSummary(0, 0, 0)
     return RunOutcome(
         outputs,
@@ -184,6 +191,7 @@ def _run(
         summary.bad_frames,
         record.seconds,
         record.reused,
+        made.findings,
     )
 
 
@@ -194,6 +202,7 @@ class _Made:
     movie: Movie | None = None
     columns: xr.Dataset = field(default_factory=xr.Dataset)
     summary: FitSummary | None = None
+    findings: tuple[str, ...] = ()
 
 
 def _stages(
@@ -228,21 +237,26 @@ def _complete_toml(outputs: RunFolder, settings: RunSettings, movie: Movie, colu
     files.write_aside(outputs.settings, _run_toml(settings, _resolved(movie, columns, outputs)).encode())
 
 
-def _report(outputs: RunFolder, session: Session) -> None:
-    """Write the report, if there is none of these tracks; whatever goes wrong, the tracks are done."""
-    from ..report.page import is_current, write_report  # takes its time to import
+def _look(outputs: RunFolder, session: Session, *, page: bool) -> tuple[str, ...]:
+    """Look at the tracks, and tell what speaks against them; whatever goes wrong, the tracks are done."""
+    from ..report.look import look  # takes its time to import
 
     send = session.send
-    send(StageStarted(REPORT, 0))
+    if page:
+        send(StageStarted(REPORT, 0))
     began, current = perf_counter(), False
+    found: list[Any] = []
     try:
-        current = session.attempt(partial(is_current, outputs.root))
-        if not current:
-            session.attempt(partial(write_report, outputs.root, figures=False))
+        found, current = session.attempt(partial(look, outputs.root, page=page))
     except Exception as error:  # noqa: BLE001  nothing in a page of figures may undo a finished run
         files.remove(outputs.report)  # it would be of other tracks
         send(Warned(f"the report could not be made: {error}"))
-    send(StageDone(REPORT, perf_counter() - began, reused=current))
+    if page:
+        send(StageDone(REPORT, perf_counter() - began, reused=current))
+    serious = [finding for finding in found if finding.serious]
+    for finding in serious:
+        send(Noticed(finding.name, finding.title, finding.text, finding.remedy))
+    return tuple(finding.name for finding in serious)
 
 
 def clear_run(outputs: RunFolder, on_event: Sink = silent, *, keep_edited: bool = False) -> None:

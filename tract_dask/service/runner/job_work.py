@@ -19,7 +19,7 @@ from ...cluster.dispatch import JOB
 from ...cluster.retries import persist
 from ...cluster.tls import using
 from ...errors import ClusterError, ExitCode, TractError
-from ...progress import Event, ShardDone, StageDone, StageStarted, Warned, clock, silent
+from ...progress import Event, Noticed, ShardDone, StageDone, StageStarted, Warned, clock, silent
 from ...readers.movie_files import FileList
 from ...run import pipeline
 from ...settings.run import RunSettings
@@ -77,6 +77,9 @@ class Reporter:
                     self._write(kind="log", level="info", message=message)
                 case Warned():
                     self._write(kind="log", level="warning", message=event.message)
+                case Noticed():
+                    message = f"{event.title}. {event.text} {event.remedy}".strip()
+                    self._write(kind="log", level="warning", message=message)
             if not isinstance(event, ShardDone) or monotonic() - self._told >= PROGRESS_S:
                 self._tell_progress()
 
