@@ -117,6 +117,23 @@ def test_intensity_in_time_has_its_errors_and_marks_what_is_not_accepted(tracks)
     assert axes.get_xlabel() == "Time (s)"
 
 
+def test_no_line_crosses_a_gap_where_frames_were_lost():
+    time = np.arange(60.0)
+    time[20:] += 5
+    time[41:] += 0.4  # late, not lost
+    short = course(time, np.arange(60.0))
+    assert np.flatnonzero(np.isnan(short.time)).tolist() == [20]
+    assert np.flatnonzero(np.isnan(short.middle)).tolist() == [20]
+    long = np.arange(20_000.0)
+    long[7001:] += 300
+    found = course(long, np.random.default_rng(0).normal(size=long.size))
+    lost = np.flatnonzero(np.isnan(found.time))
+    assert len(lost) == 1
+    assert found.time[lost[0] - 1] < 7001 < 7300 < found.time[lost[0] + 1]
+    assert all(np.isnan(values[lost[0]]) for values in found)
+    assert np.isfinite(np.delete(found.low, lost)).all()
+
+
 def test_a_long_course_is_drawn_as_quantiles_of_runs():
     rng = np.random.default_rng(0)
     time = np.arange(30_000.0)

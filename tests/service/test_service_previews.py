@@ -181,6 +181,24 @@ def test_a_frame_of_any_format_is_shown_as_it_is(service, place, more, gain):
     np.testing.assert_array_equal(decoded(answer.content), mapped(gain * service.movie[3].astype(float), 0, 12))
 
 
+@pytest.mark.parametrize("path", ["movie.npy", "out/movie.zarr"])
+def test_a_part_of_a_movie_is_shown_and_described(service, path):
+    params = {"path": path, "frames": "1:4:2", "roi": "2:18,4:24", "bin": 2}
+    about = service.get("files/about", params=params).json()
+    assert about["shape"] == [2, 8, 10]
+    own = service.get("files/about", params={"path": path}).json()
+    assert about["file_pixel_size_pm"] == own["pixel_size_pm"] == own["file_pixel_size_pm"]
+    if own["pixel_size_pm"]:
+        assert about["pixel_size_pm"] == 2 * own["pixel_size_pm"]
+    summed = service.movie[3, 2:18, 4:24].astype(float).reshape(8, 2, 10, 2).sum((1, 3))
+    answer = service.get("files/frame.png", params=params | {"frame": 1, "low": 0, "high": 60, "width": 10})
+    gain = 2 if path.endswith(".zarr") else 1  # as it was converted
+    np.testing.assert_array_equal(decoded(answer.content), mapped(gain * summed, 0, 60))
+    refused = service.get("files/about", params={"path": path, "roi": "0:5"})
+    assert refused.status_code == 400
+    assert "roi" in refused.text
+
+
 def test_the_sum_is_shown_with_gaps_where_nothing_was_exposed(service):
     about = service.get(f"{service.job}/sum").json()
     assert about["shape"] == [20, 30]

@@ -307,7 +307,7 @@ class Course(NamedTuple):
     Attributes
     ----------
     time, middle
-        (points,): the frames' own, or the means of runs and the medians in them.
+        (points,): the frames' own, or the means of runs and the medians in them; NaN where frames were lost.
     low, high
         (points,): the 16 and 84 % quantiles of runs; empty where every frame is drawn.
     least, most
@@ -322,20 +322,29 @@ class Course(NamedTuple):
     most: Floats
 
 
+_LOST = 1.5
+"""A step so many times the usual one is a gap, which no line crosses."""
+
+
 def course(time: Floats, values: Floats) -> Course:
     """Return a value in time, as it is to be drawn: no more than some hundred points, whatever the number of frames."""
     nothing = np.empty(0)
+    steps = np.diff(time)
+    gaps = np.flatnonzero(steps > _LOST * np.median(steps)) + 1 if len(steps) > 1 else np.empty(0, int)
     if len(time) <= _MOST_POINTS:
-        return Course(time, values, nothing, nothing, nothing, nothing)
-    edges = np.linspace(0, len(time), _RUNS + 1).round().astype(int)
-    rows = np.full((5, _RUNS), np.nan)
+        apart = np.insert(time, gaps, np.nan), np.insert(np.asarray(values, np.float64), gaps, np.nan)
+        return Course(*apart, nothing, nothing, nothing, nothing)
+    runs = np.linspace(0, len(time), _RUNS + 1).round().astype(int)
+    edges = np.unique(np.concatenate([runs, gaps[: _RUNS // 2]]))
+    rows = np.full((5, len(edges) - 1), np.nan)
     for number, (start, stop) in enumerate(pairwise(edges)):
         run = values[start:stop]
         run = run[np.isfinite(run)]
         if run.size:
             rows[:, number] = np.quantile(run, [0.5, 0.16, 0.84, 0.0, 1.0])
     middle = np.array([time[start:stop].mean() for start, stop in pairwise(edges)])
-    return Course(middle, *rows)
+    before = np.flatnonzero(np.isin(edges, gaps))
+    return Course(np.insert(middle, before, np.nan), *np.insert(rows, before, np.nan, axis=1))
 
 
 def draw_course(axes: Axes, found: Course, colour: str, label: str = "") -> None:

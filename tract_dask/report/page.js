@@ -51,7 +51,7 @@ const charts = Object.fromEntries(Object.keys(LABELS).map((name) => [name, lineC
 
 function seriesOf(name) {
   const values = Object.fromEntries(Object.entries(series[name]).map(([kind, one]) => [kind, valuesOf(one, chosen)]));
-  const { mean, error, low, high } = values, own = { x: time, y: mean, color: CHOSEN };
+  const { mean, error, low, high } = values, own = { x: time, y: mean, color: CHOSEN, gaps: true };
   const line = {
     ...own, name: LABELS[name], kind: time.length <= FEW ? "dots" : "line",
     low: mean.map((value, index) => value - error[index]), high: mean.map((value, index) => value + error[index]),
@@ -108,7 +108,7 @@ const mark = () => map.show({ chosen: new Map([[ids[chosen], theme.color(`--seri
 
 // ---- all frames ----
 const inFrames = { group: "frames", height: 200, formatX: inTime.formatX, xLabel: `time (${timeUnit})` };
-const curve = (name, y, color, own) => ({ name, x: frames.time, y, color, unit: own });
+const curve = (name, y, color, own) => ({ name, x: frames.time, y, color, unit: own, gaps: true });
 const frameCharts = [
   lineChart(at("drift"), { ...inFrames, label: "Drift in time", yLabel: `drift (${unit})`, series: [curve("x", frames.x, 1, unit), curve("y", frames.y, 2, unit)] }),
   lineChart(at("accepted"), {

@@ -183,7 +183,7 @@ def about_movie(place: str | FileList, declared: dict[str, Any], permit: Permit)
     """Return what a movie says about itself, ready for JSON; for a process of the pool."""
     settings = from_dict(SourceSettings, {name: value for name, value in declared.items() if value is not None})
     with closing(open_source(place, settings, permit=permit)) as source:
-        known = source.metadata
+        known, own = source.metadata, getattr(source, "whole", source).metadata
         return {
             "format": source.format,
             "files": len(source.files),
@@ -193,6 +193,8 @@ def about_movie(place: str | FileList, declared: dict[str, Any], permit: Permit)
             "pixel_size_pm": known.pixel_size_pm,
             "frame_time_s": known.frame_time_s,
             "time_stamps": has_stamps(known),
+            "file_pixel_size_pm": own.pixel_size_pm,
+            "file_frame_time_s": own.frame_time_s,
             "dose": known.dose,
             "gain": known.gain,
             "warnings": list(known.notes),

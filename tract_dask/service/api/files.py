@@ -12,6 +12,7 @@ from ..checks import about_movie
 from ..data_root import PAGE
 from ..services import Served
 from .models import RelativePath, Shape, errors
+from .requests import PartOfMovie
 
 router = APIRouter(tags=["files"])
 
@@ -69,6 +70,8 @@ class About(BaseModel):
                 "pixel_size_pm": 8.0,
                 "frame_time_s": 0.025,
                 "time_stamps": False,
+                "file_pixel_size_pm": 8.0,
+                "file_frame_time_s": 0.025,
                 "dose": None,
                 "gain": 1.0,
                 "warnings": [],
@@ -85,6 +88,8 @@ class About(BaseModel):
     pixel_size_pm: float | None = Field(description="Side of a pixel in pm; null: the file does not say.")
     frame_time_s: float | None = Field(description="From one frame to the next, in s.")
     time_stamps: bool = Field(description="Whether each frame has a time stamp; ``frame_time_s`` is their usual step.")
+    file_pixel_size_pm: float | None = Field(description="The same of the whole movie, before pixels are summed.")
+    file_frame_time_s: float | None = Field(description="The same of the whole movie, before frames are left out.")
     dose: float | None = Field(description="Of a frame, in e/A^2.")
     gain: float = Field(description="Electron counts for one detector unit.")
     warnings: list[str] = Field(description="What the user should read.")
@@ -112,15 +117,16 @@ def list_files(
 async def about_file(
     services: Served,
     path: MoviePath,
+    part: PartOfMovie,
     raw_shape: Annotated[
         list[int] | None, Query(description="Of a raw file: frames, rows, columns.", min_length=3, max_length=3)
     ] = None,
     raw_dtype: Annotated[RelativePath | None, Query(description="Of a raw file, such as uint16.")] = None,
     raw_offset: Annotated[int, Query(ge=0, le=2**53, description="Of a raw file: bytes to skip.")] = 0,
 ) -> dict[str, Any]:
-    """Read what a movie says about itself, without its pixels."""
+    """Read what a movie, or a part of it, says about itself, without its pixels."""
     root = services.root
-    declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset}
+    declared = {"raw_shape": raw_shape, "raw_dtype": raw_dtype, "raw_offset": raw_offset} | part
     place, file = await run_in_threadpool(root.source, path), root.path / path
     found = await services.pool.run(about_movie, place, declared, root.permit, about=file)
     return root.shown(found) | {"path": path}

@@ -23,7 +23,7 @@ from ..views.pictures import MAX_SIDE_PX, View
 from .answers import NOT_MODIFIED, Version, kept_answer, stamp
 from .column_desk import ColumnDesk, Desk
 from .models import JobId, RelativePath, errors
-from .requests import folder_of
+from .requests import PartOfMovie, folder_of
 
 router, sums = APIRouter(tags=["previews"]), APIRouter()
 
@@ -92,15 +92,18 @@ FrameNumber = Annotated[int, Query(ge=0, le=2**53, description="Number of the fr
 
 
 def declared_raw(
+    part: PartOfMovie,
     raw_shape: Annotated[
         str, Query(pattern=r"^(\d{1,9},\d{1,9},\d{1,9})?$", description="Frames,rows,columns of a raw binary file.")
     ] = "",
     raw_dtype: Annotated[str, Query(max_length=16, description="Pixel type of a raw binary file.")] = "",
     raw_offset: Annotated[int, Query(ge=0, le=2**53, description="Bytes to skip at its start.")] = 0,
 ) -> SourceSettings:
-    """Return how a raw file is to be read."""
+    """Return how a raw file is to be read, and which part of any movie."""
     shape = tuple(map(int, raw_shape.split(","))) if raw_shape else None
-    return SourceSettings(shape, raw_dtype or None, raw_offset)
+    return from_dict(
+        SourceSettings, {"raw_shape": shape, "raw_dtype": raw_dtype or None, "raw_offset": raw_offset} | part
+    )
 
 
 def declared_gain(
@@ -208,8 +211,9 @@ def _version(place: str | FileList) -> str:
 def _job_movie(services: Services, job_id: str) -> tuple[tuple[str | FileList, SourceSettings, MetadataSettings], str]:
     """Return where the movie of a job is, converted if it is already, and its version."""
     job, converted = services.store.job(job_id), folder_of(services, job_id, MOVIE) / MOVIE
-    place = str(converted) if attributes(converted).get("complete") else services.root.source(job.source)
-    source = from_dict(SourceSettings, job.settings.get("source", {}))
+    is_part = bool(attributes(converted).get("complete"))  # the converted movie is the part that the job reads
+    place = str(converted) if is_part else services.root.source(job.source)
+    source = from_dict(SourceSettings, {} if is_part else job.settings.get("source", {}))
     metadata = from_dict(MetadataSettings, job.settings.get("metadata", {}))
     return (place, source, metadata), _version(place)
 

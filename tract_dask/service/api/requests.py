@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import Depends
+from fastapi import Depends, Query
 
 from ..auth.tokens import Identity, identity, may_change
 from ..jobs.records import Job
@@ -33,6 +33,19 @@ def own_job(job_id: JobId, services: Served, who: Who) -> Job:
 
 OwnJob = Annotated[Job, Depends(own_job)]
 """The job of a route that changes it: every such route takes it in this way."""
+
+
+def part_of_movie(
+    frames: Annotated[str, Query(max_length=64, description="Frames start:stop:step of a part; all where empty.")] = "",
+    roi: Annotated[str, Query(max_length=64, description="Rows and columns y0:y1,x0:x1 of a part.")] = "",
+    side: Annotated[int, Query(alias="bin", ge=1, le=1 << 15, description="Side of squares that are summed, px.")] = 1,
+) -> dict[str, Any]:
+    """Return which part of a movie is meant, as the settings of the source have it."""
+    return {"frames": frames or None, "roi": roi or None, "bin": side}
+
+
+PartOfMovie = Annotated[dict[str, Any], Depends(part_of_movie)]
+"""Which part of a movie is looked at."""
 
 
 def folder_of(services: Services, job_id: str, *names: str) -> Path:

@@ -175,7 +175,7 @@ def source_plane(frame: MovieFrame) -> Plane:
     InputError
         Where there is no such frame, or the movie cannot be opened.
     """
-    if _is_converted(frame.path):
+    if _is_converted(frame.path) and (frame.source.frames, frame.source.roi, frame.source.bin) == (None, None, 1):
         return movie_plane(_opened_movie(str(frame.path), frame.stamp), frame.number)
     opened = open_cached(frame.path, frame.source, frame.metadata, permit=frame.permit)
     _check_frame(frame.number, opened.shape[0])

@@ -16,6 +16,7 @@ import { firstNotBelow } from "./chart_scale.js";
  * @property {boolean} [right]
  * @property {string} [unit]
  * @property {boolean} [dashed]
+ * @property {boolean} [gaps]
  * @typedef {[x: number, y: number]} Spot in px
  * @typedef {{ x: number, low: number, high: number }} Slice of a band, px
  */
@@ -39,7 +40,7 @@ export function paintSeries(pen, one, colour, [x0, x1], place, box) {
   pen.lineWidth = 1.6;
   pen.lineJoin = "round";
   pen.setLineDash(one.dashed ? [5, 4] : []);
-  const runs = one.kind === "points" ? [] : thinned(one.x, one.y, start, stop, place);
+  const runs = one.kind === "points" ? [] : thinned(one, start, stop, place);
   for (const run of runs) {
     pen.beginPath();
     for (const [x, y] of run) pen.lineTo(x, y);
@@ -104,8 +105,10 @@ function bands(one, start, stop, place) {
   /** @type {Slice[][]} */
   const runs = [];
   let run = /** @type {Slice[] | null} */ (null);
+  const reach = reachOf(one);
   for (let index = start; index < stop; index += 1) {
     const least = one.low?.[index], most = one.high?.[index];
+    if (one.x[index] - one.x[index - 1] > reach) run = null;
     if (!known(least) || !known(most)) { run = null; continue; }
     if (!run) runs.push(run = []);
     const x = place.x(one.x[index]), low = place.y(least), high = place.y(most), last = run[run.length - 1];
@@ -117,11 +120,11 @@ function bands(one, start, stop, place) {
 
 /**
  * The runs between gaps as points in px; where several fall on a pixel, its first, lowest, highest and last.
- * @param {ArrayLike<number>} xs
- * @param {Gappy} ys
+ * @param {Series} one
  * @param {Places} place
  */
-function thinned(xs, ys, start, stop, place) {
+function thinned(one, start, stop, place) {
+  const { x: xs, y: ys } = one, reach = reachOf(one);
   /** @type {Spot[][]} */
   const runs = [];
   let run = /** @type {Spot[] | null} */ (null);
@@ -137,6 +140,7 @@ function thinned(xs, ys, start, stop, place) {
   };
   for (let index = start; index < stop; index += 1) {
     const y = ys[index];
+    if (xs[index] - xs[index - 1] > reach) { flush(); run = null; }
     if (!known(y)) { flush(); run = null; continue; }
     if (!run) runs.push(run = []);
     const point = /** @type {Spot} */ ([place.x(xs[index]), place.y(y)]), pixel = Math.floor(point[0]);
@@ -147,6 +151,24 @@ function thinned(xs, ys, start, stop, place) {
   }
   flush();
   return runs;
+}
+
+const LOST = 1.5; // a step so many times the usual one is a gap, in which frames were lost
+/** @type {WeakMap<object, number>} */
+const reaches = new WeakMap();
+
+/**
+ * How far apart points may be that a line joins: any distance, or in a series with `gaps` little more than the usual step.
+ * @param {Series} one
+ */
+function reachOf({ x, gaps }) {
+  if (!gaps || x.length < 3) return Infinity;
+  const kept = reaches.get(x);
+  if (kept !== undefined) return kept;
+  const steps = Array.from({ length: x.length - 1 }, (_, index) => x[index + 1] - x[index]).sort((a, b) => a - b);
+  const reach = LOST * steps[Math.floor(steps.length / 2)];
+  reaches.set(x, reach);
+  return reach;
 }
 
 /**

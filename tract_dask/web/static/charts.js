@@ -35,9 +35,10 @@ const DRAG_PX = 5; // a shorter drag is a click
  * @param {HTMLElement} element where it goes; it takes the width, and keeps its height
  * @param {LineChanges} options
  *   label: what it shows, for screen readers;  height: px (200)
- *   series: [{ name, x, y, low, high, color, kind, right, unit, dashed }]: `x` ascending; null and NaN are gaps;
+ *   series: [{ name, x, y, low, high, color, kind, right, unit, dashed, gaps }]: `x` ascending; null and NaN are gaps;
  *     `low`, `high` a band; `color` 1 to 6 (a series variable of theme.css) or a CSS colour; `kind` "line", "area", "points",
- *     "dots" (line and points), "bars" (`x` holds one edge more than `y`), "band" (no line); `right` the right-hand axis
+ *     "dots" (line and points), "bars" (`x` holds one edge more than `y`), "band" (no line); `right` the right-hand axis;
+ *     with `gaps` a line ends before a step of `x` that is half as long again as the usual one
  *   xLabel, yLabel, rightLabel: with the unit
  *   xRange, yRange, rightRange: [low, high]; null in it is fitted to the data
  *   formatX, formatY: (number) => text, for what is under the pointer

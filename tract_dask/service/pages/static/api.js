@@ -51,6 +51,8 @@ import { at } from "./dom.js";
  * @property {number | null} frame_time_s
  * @property {number | null} dose
  * @property {number | null} gain
+ * @property {number | null} file_pixel_size_pm
+ * @property {number | null} file_frame_time_s
  * @property {boolean} time_stamps
  * @property {string[]} warnings
  * @typedef {object} Summary of results

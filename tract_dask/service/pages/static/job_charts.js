@@ -78,7 +78,7 @@ export class FrameCharts {
     const formatX = (value) => (timeUnit === "s" ? duration(value) : `frame ${significant(value, 6)}`);
     const known = share.filter((value) => value !== null);
     this.note.textContent = known.length ? `mean ${percent(known.reduce((sum, value) => sum + value, 0) / known.length)}` : "";
-    this.accepted.update({ xLabel, formatX, series: [{ name: "", x: t, y: share.map((value) => (value === null ? null : 100 * value)), color: 3, kind: "area" }] });
-    this.drift.update({ xLabel, formatX, yLabel: unit, series: [{ name: "x", unit, x: t, y: scaled(x), color: 1 }, { name: "y", unit, x: t, y: scaled(y), color: 2 }] });
+    this.accepted.update({ xLabel, formatX, series: [{ name: "", x: t, y: share.map((value) => (value === null ? null : 100 * value)), color: 3, kind: "area", gaps: true }] });
+    this.drift.update({ xLabel, formatX, yLabel: unit, series: [{ name: "x", unit, x: t, y: scaled(x), color: 1, gaps: true }, { name: "y", unit, x: t, y: scaled(y), color: 2, gaps: true }] });
   }
 }

@@ -86,6 +86,7 @@ async function readMovie() {
     showMetadata(found);
   } catch (error) {
     if (source !== path) return;
+    if (about && form.showRefused(error)) { plan(); return; } // such as a part that is half typed
     at("preview").hidden = true;
     setText(at("source-facts"), "");
     at("source-problem").replaceChildren(h("div", { class: "notice bad", role: "alert" }, h("p", {}, h("b", {}, error.what)), error.expected && h("p", { class: "small" }, `Expected ${error.expected}${error.got ? `; got ${error.got}` : ""}`), h("p", {}, error.remedy)));
@@ -95,16 +96,16 @@ async function readMovie() {
 }
 
 /**
- * The part of the settings that says how a raw file is read.
+ * The settings that say how a raw file is read, and which part of any movie.
  * @param {Values} values
  */
 function readingOf(values) {
-  const { raw_shape, raw_dtype, raw_offset } = values.source ?? {};
-  return { raw_shape, raw_dtype, raw_offset };
+  const { raw_shape, raw_dtype, raw_offset, frames, roi, bin } = values.source ?? {};
+  return { raw_shape, raw_dtype, raw_offset, frames, roi, bin };
 }
 
 /** @param {Movie} movie */
-function showMetadata({ pixel_size_pm, frame_time_s, dose, gain, warnings }) {
+function showMetadata({ file_pixel_size_pm: pixel_size_pm, file_frame_time_s: frame_time_s, dose, gain, warnings }) {
   const known = (/** @type {number | null} */ value, digits = 4) => (value === null ? "unknown" : significant(value, digits));
   for (const [name, value] of Object.entries({ pixel_size_pm, frame_time_s, dose, gain })) form.get(`metadata.${name}`)?.setPlaceholder(known(value));
   const missing = [[pixel_size_pm, "pixel size", "results stay in px"], [frame_time_s, "frame time", "time is in frames"]]
@@ -122,7 +123,8 @@ function onChange() {
   waiting = setTimeout(() => {
     const values = form.values();
     const reading = JSON.stringify(values && readingOf(values));
-    preview.setPixelSize(values?.metadata?.pixel_size_pm ?? about?.pixel_size_pm ?? null);
+    const given = values?.metadata?.pixel_size_pm; // of a pixel on disk
+    preview.setPixelSize(given ? given * (values?.source?.bin ?? 1) : about?.pixel_size_pm ?? null);
     if (values && reading !== read) { read = reading; if (source) readMovie(); } else plan();
   }, WAIT_MS);
 }

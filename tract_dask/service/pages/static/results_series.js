@@ -119,7 +119,7 @@ export class SeriesPanel {
   draw() {
     const all = this.ids.flatMap((id) => this.found.get(id) ?? []);
     const lines = (/** @type {string} */ name) => all.map((one) => ({
-      name: String(one.column_id), unit: this.unitOf(name), x: one.t, y: one[name], color: this.slots.get(one.column_id),
+      name: String(one.column_id), unit: this.unitOf(name), x: one.t, y: one[name], gaps: true, color: this.slots.get(one.column_id),
       low: one[name].map((/** @type {number | null} */ value, /** @type {number} */ index) => beside(value, one[`${name}_stderr`][index], -1)),
       high: one[name].map((/** @type {number | null} */ value, /** @type {number} */ index) => beside(value, one[`${name}_stderr`][index], 1)),
     }));
