@@ -16,9 +16,11 @@ from click.testing import CliRunner
 from conftest import Scene
 from distributed import Client, LocalCluster
 
+from tract_dask import convert
 from tract_dask.cli.main import main
 from tract_dask.errors import DestinationError, MissingStoreError, StoreError
 from tract_dask.progress import StageDone
+from tract_dask.report.page import write_report
 from tract_dask.run import one_stage, pipeline
 from tract_dask.run.verify import verify
 from tract_dask.settings import ConvertSettings, RunSettings
@@ -392,6 +394,25 @@ def test_verify_names_what_is_wrong_and_repairs_the_movie(run, copy):
     assert read(movie) == read(run / "movie.zarr")
 
 
+def test_stores_of_two_runs_in_one_folder_are_named(run, copy, tmp_path):
+    """Somebody has put the movie of another run, of the same shape, in the place of the first."""
+    np.save(tmp_path / "other.npy", Scene(amplitude=50.0).counts())
+    convert(tmp_path / "other.npy", tmp_path / "other.zarr", settings=SETTINGS.convert)
+    shutil.rmtree(copy / "movie.zarr")
+    shutil.copytree(tmp_path / "other.zarr", copy / "movie.zarr")
+    found = verify(copy)
+    others = [f"{name}.zarr" for name in ("drift", "sum", "columns", "results")]
+    assert [fault.store.name for fault in found.faults if fault.what == "of another run"] == others
+    assert not found.sound
+    assert "Move the stores of one of the two runs out of" in found.text()
+    assert command(copy)[0] == 1
+    page = write_report(copy, tmp_path / "report.html", figures=False).read_text()
+    assert "Stores of two runs" in page
+    assert "drift.zarr and sum.zarr and columns.zarr and results.zarr" in page
+    with pytest.raises(DestinationError, match="another movie"):
+        pipeline.run(run.parent / "movie.npy", copy, SETTINGS)
+
+
 def test_verify_is_silent_about_what_people_and_kills_do(copy):
     table, events = copy / "columns.csv", copy / "events.jsonl"
     assert verify(copy).notes == ()
@@ -476,7 +497,7 @@ def test_a_small_file_that_is_mended_as_advised_is_sound(run, copy, name):
 def test_repair_refuses_another_source(run, copy, tmp_path):
     (copy / "movie.zarr" / "0" / "c.0.0.0").unlink()
     store_metadata.update_attributes(copy / "movie.zarr", source=str(tmp_path / "other.npy"))
-    np.save(tmp_path / "other.npy", Scene(seed=5).counts())
+    np.save(tmp_path / "other.npy", Scene(amplitude=50.0).counts())
     code, _ = command(copy, "--repair")
     assert code == 2
     (tmp_path / "other.npy").unlink()

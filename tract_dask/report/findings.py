@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..store.schema import AXES, Status
+from ..store.strangers import advice
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -66,7 +67,7 @@ class Finding:
 
 def findings(run: Survey) -> list[Finding]:
     """Return what there is to know of a run, warnings first."""
-    checks = (_calibration, _found, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
+    checks = (_mixed, _calibration, _found, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
     found = [finding for check in checks for finding in check(run)]
     return sorted(found, key=lambda finding: not finding.serious)
 
@@ -94,6 +95,16 @@ def count(number: int, what: str) -> str:
     ('1 frame', '12,000 frames')
     """
     return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def _mixed(run: Survey) -> Iterator[Finding]:
+    if others := run.about.get("strangers"):
+        yield Finding(
+            "mixed",
+            "Stores of two runs",
+            f"{' and '.join(others)}: made from another movie than movie.zarr, which lies beside.",
+            f"{advice(run.folder)}.",
+        )
 
 
 def _calibration(run: Survey) -> Iterator[Finding]:

@@ -24,6 +24,7 @@ from ..settings.toml import load
 from ..store import datasets, metadata, results, schema
 from ..store.files import read_small
 from ..store.run_folder import RunFolder
+from ..store.strangers import strangers
 
 VALUES = 1_600_000
 """Numbers that the series of all columns together may have: 4 MB of the page."""
@@ -43,7 +44,8 @@ class Survey:
     Attributes
     ----------
     about
-        What results.zarr says of itself; and ``movie``, what movie.zarr says.
+        What results.zarr says of itself; ``movie``: what movie.zarr says; ``strangers``: names of the stores that
+        were made from another movie.
     settings
         Those of the run; None where they cannot be read.
     known
@@ -109,13 +111,14 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     known = overview.Calibration.of(about)
     measured = tracks.assign_attrs(pixel_size_pm=known.scale)
     columns, frames, series = gathered(measured, None if small else results.variables(places.results))
-    if places.drift.exists():
+    others = strangers(folder)
+    if places.drift.exists() and places.drift not in others:
         frames["quality"] = ("frame", datasets.open_dataset(places.drift)["quality"].to_numpy())
     columns["residual"] = ("column_id", residuals(tracks, summed)[0])
     return Survey(
         folder=folder,
         tracks=measured,
-        about=about | {"movie": metadata.attributes(places.movie)},
+        about=about | {"movie": metadata.attributes(places.movie), "strangers": [path.name for path in others]},
         settings=_settings(places.settings),
         known=known,
         columns=columns,

@@ -9,6 +9,8 @@ from typing import Any
 
 from ..store import damage
 
+STRANGE = "of another run"
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -21,8 +23,8 @@ class Fault:
     stage
         The one that wrote it; ``run`` where it is of no stage.
     what
-        ``damaged``, ``missing``, ``unreadable`` (by an error of the system) or ``left over``: no part of the store, as
-        a writer that was killed leaves it, which does no harm.
+        ``damaged``, ``missing``, ``unreadable`` (by an error of the system), :data:`STRANGE`, or ``left over``: no part
+        of the store, as a writer that was killed leaves it, which does no harm.
     frames
         The first frame in it and the one behind the last; None where it has none.
     help

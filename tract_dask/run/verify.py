@@ -24,8 +24,9 @@ from ..store.locks import sole_use
 from ..store.ome import AXES, CHANGING
 from ..store.parts import SHARDED, Parts, layout
 from ..store.shard_files import ABSENT, read_index, unchecked
+from ..store.strangers import WHY, advice, strangers
 from .beside import Beside, look_beside
-from .faults import Fault
+from .faults import STRANGE, Fault
 
 _AT_ONCE = 8
 """Files that are read at a time."""
@@ -67,7 +68,7 @@ class Verified:
     @property
     def remedies(self) -> list[str]:
         """What to do, a sentence for each store, or file, that needs it."""
-        kinds = (("damaged", "missing"), ("left over",))
+        kinds = ((STRANGE,), ("damaged", "missing"), ("left over",))
         found = [fault.remedy for kind in kinds for fault in self.faults if fault.what in kind]
         unreadable = [fault.file for fault in self.faults if fault.what == "unreadable"]
         found += [f"Repair the disk or the permissions of {unreadable[0]}"] if unreadable else []
@@ -107,13 +108,19 @@ def verify(path: Path, on_event: Sink = silent) -> Verified:
     found = [_verify_store(store, on_event) for store in there]
     alone = there == [path.absolute()]
     beside = Beside((), (), 0) if alone else look_beside(path.absolute(), there)
+    others = () if alone else tuple(map(_stranger, strangers(path.absolute())))
     return Verified(
-        (*(fault for one in found for fault in one.faults), *beside.faults),
+        (*(fault for one in found for fault in one.faults), *others, *beside.faults),
         sum(one.files for one in found) + beside.files,
         tuple(store for one in found for store in one.unfinished),
         tuple(store for one in found for store in one.without_checksums),
         beside.notes,
     )
+
+
+def _stranger(store: Path) -> Fault:
+    stage = _STAGES.get(store.stem, store.stem)
+    return Fault(store / METADATA, store, stage, STRANGE, WHY, help=advice(store.parent))
 
 
 def stores_in(path: Path) -> list[Path]:

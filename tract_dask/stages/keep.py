@@ -18,6 +18,7 @@ from ..store.arrays import DamagedArrayError
 from ..store.journal import journal_beside, remove_journal
 from ..store.movie import Movie
 from ..store.provenance import provenance
+from ..store.strangers import MOVIE_KEY
 
 Workers = Callable[[], Client]
 """Gives the client; connects at its first call (:class:`tract_dask.cluster.connect.LazyClient`)."""
@@ -50,13 +51,13 @@ def kept(
         on_event(StageDone(stage, 0.0, reused=True))
         dataset = datasets.open_dataset(path)
         if dataset.attrs.get("pixel_size_pm") == movie.pixel_size_pm:
-            return dataset
+            return dataset.assign_attrs({MOVIE_KEY: movie.key})
     else:
         dataset = _made(partial(make, journal_beside(path)), on_event)
     dataset.attrs["pixel_size_pm"] = movie.pixel_size_pm
-    save(dataset, path, key, settings, stage, source=str(movie.path))
+    save(dataset, path, key, settings, stage, source=str(movie.path), **{MOVIE_KEY: movie.key})
     remove_journal(journal_beside(path))
-    return dataset
+    return dataset.assign_attrs({MOVIE_KEY: movie.key})
 
 
 def _made(make: Callable[[], xr.Dataset], on_event: Sink) -> xr.Dataset:
@@ -72,7 +73,7 @@ def _made(make: Callable[[], xr.Dataset], on_event: Sink) -> xr.Dataset:
 def save(dataset: xr.Dataset, path: Path, key: str, settings: Settings, kind: str, **more: Any) -> None:
     """Write the result of a stage with its provenance."""
     about = provenance(key, settings) | {"kind": kind, "complete": True} | more
-    known = {name: value for name, value in dataset.attrs.items() if value is not None}
+    known = {name: value for name, value in dataset.attrs.items() if value is not None and name != MOVIE_KEY}
     stored = dataset.copy()
     stored.attrs = metadata.json_ready(known | {metadata.ATTRIBUTE: about})
     datasets.write_dataset(stored, path)

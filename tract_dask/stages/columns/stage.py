@@ -23,6 +23,7 @@ from ...store.columns import check_inside, columns_csv, read_columns_csv
 from ...store.held import check_held
 from ...store.keys import counted, stage_key
 from ...store.schema import Status
+from ...store.strangers import MOVIE_KEY
 from ..keep import content, save
 
 Draw = Callable[[xr.Dataset, xr.Dataset, Path], object]
@@ -80,6 +81,7 @@ def columns_stage(
     if table != before.content:
         before.make_room(on_event)  # before the store, which would else take the old table for an edited one
     known = {"table": _digest(table), "edited": edited, "seeds": before.origin, "pixel_size_pm": pixel_size}
+    known[MOVIE_KEY] = summed.attrs.get(MOVIE_KEY)
     save(found, store, key, settings, "columns", **known)
     if not csv.exists():
         files.write_aside(csv, table)

@@ -24,6 +24,7 @@ from ...store.columns import positions
 from ...store.journal import left_over
 from ...store.movie import Movie
 from ...store.provenance import provenance
+from ...store.strangers import MOVIE_KEY
 from ..columns.window_size import neighbour_distance, resolve_window
 from ..pixel_range import check_pixels
 from .vacuum import check_box, find_vacuum
@@ -62,6 +63,7 @@ class Job:
             movie.frame_values(),
             **provenance(key, self.settings, str(movie.path)),
             **calibration(movie),
+            **{MOVIE_KEY: movie.key},
             part=movie.part,
             window=self.window_px,
             vacuum=self.vacuum,
