@@ -81,11 +81,9 @@ def columns_stage(
     if table != before.content:
         before.make_room(on_event)  # before the store, which would else take the old table for an edited one
     known = {"table": _digest(table), "edited": edited, "seeds": before.origin, "pixel_size_pm": pixel_size}
-    known[MOVIE_KEY] = summed.attrs.get(MOVIE_KEY)
-    save(found, store, key, settings, "columns", **known)
+    save(found, store, key, settings, "columns", **known, **{MOVIE_KEY: summed.attrs.get(MOVIE_KEY)})
     if not csv.exists():
         files.write_aside(csv, table)
-    check_held(figure)
     figure.unlink(missing_ok=True)  # it is of other columns
     draw(summed, found.copy(), figure)
     on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
