@@ -15,7 +15,7 @@ from files_dm import write_director
 from files_stamped import write_mib, write_seq
 from serviced import FRAMES, URL, make_app, make_root
 
-from tract_dask.errors import MissingSourceError, TractError
+from tract_dask.errors import ChangedSourceError, MissingSourceError, TractError
 from tract_dask.progress import ShardDone, StageStarted
 from tract_dask.readers import READERS, merlin, open_source
 from tract_dask.readers.movie_files import FileList, list_files
@@ -226,6 +226,7 @@ def order_of(root: DataRoot, source: str) -> dict:
         "root": str(root.path),
         "closed": [],
         "mark": vars(Mark("ana", "0123456789", "jobs/0123456789")),
+        "content": "",
         "settings": settings,
         "cluster": to_dict(RunSettings())["cluster"],
         "columns": None,
@@ -270,6 +271,26 @@ def test_a_job_fails_whose_source_came_to_lead_out(api, root):
     process = JobProcess(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)
     with pytest.raises(TractError, match="data root"):
         process._order()
+
+
+@pytest.mark.parametrize("change", ["other pixels", "longer", "one more file"])
+def test_a_movie_that_was_replaced_since_its_job_was_submitted_is_refused(api, root, change):
+    (root / "frames").mkdir()
+    for number in range(2):
+        np.save(root / "frames" / f"f_{number}.npy", np.full(FRAMES, number, np.uint8))
+    source = "frames" if change == "one more file" else "movie.npy"
+    job = api.post("jobs", json={"source": source}).json()
+    other = np.ones((FRAMES[0] + (change == "longer"), *FRAMES[1:]), np.uint8)
+    status = (root / "movie.npy").stat()
+    np.save(root / ("frames/f_2.npy" if change == "one more file" else "movie.npy"), other)
+    os.utime(root / "movie.npy", ns=(status.st_atime_ns, status.st_mtime_ns))
+    state = api.app.state.services
+    state.store.change(job["id"], State.RUNNING)
+    order = JobProcess(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)._order()
+    cluster = to_dict(RunSettings())["cluster"]
+    with pytest.raises(ChangedSourceError, match="not what it was when the job was submitted"):
+        run_order(order | {"cluster": cluster}, Reporter(io.StringIO(), {}))
+    assert not (root / job["output"] / "movie.zarr").exists()
 
 
 def test_an_order_has_the_settings_as_they_are_stored(api, root):

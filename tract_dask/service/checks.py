@@ -25,6 +25,7 @@ from ..run.checks import check_inputs, check_output
 from ..run.plan import Plan, plan_run
 from ..settings.run import RunSettings, SourceSettings
 from ..settings.toml import from_dict
+from ..stages.convert.origin import origin_of
 from ..store.movie import open_movie
 from ..store.run_folder import RunFolder
 from .data_root import DataRoot
@@ -49,11 +50,20 @@ _WHOLE = frozenset(STAGES)
 
 @dataclass(frozen=True)
 class Checked:
-    """What the checks found out about a job: its movie's shape (frames, y, x), its pixel type, the plan of its run."""
+    """What the checks found out about a job.
+
+    Attributes
+    ----------
+    shape, dtype
+        The movie's frames, rows and columns, and its pixel type.
+    content
+        A hash of what it holds.
+    """
 
     shape: tuple[int, int, int]
     dtype: str
     plan: Plan
+    content: str
 
 
 async def check_job(
@@ -176,7 +186,8 @@ def check_source(place: str | FileList, stored: dict[str, Any], folder: Path | N
             check_output(RunFolder(folder), source, settings, overwrite=False)
         if _raw_bytes((1, *source.shape[1:]), source.dtype.name) <= _TRIED_BYTES:
             source.read(0, 1)
-        return Checked(source.shape, source.dtype.name, plan_run(source.shape, source.dtype, settings))
+        plan = plan_run(source.shape, source.dtype, settings)
+        return Checked(source.shape, source.dtype.name, plan, origin_of(source).content)
 
 
 def about_movie(place: str | FileList, declared: dict[str, Any], permit: Permit) -> dict[str, Any]:

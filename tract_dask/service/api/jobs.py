@@ -27,7 +27,7 @@ _LINKS = ("events", "log", "columns", "sum", "results", "report")
 @router.post("/jobs", status_code=201, response_model=JobRecord, responses=errors(400, 404, 409, 503))
 async def submit_job(new: NewJob, request: Request, response: Response, services: Served, who: Who) -> Job:
     """Queue a job, after the checks that a run makes before it starts: the movie opens, and the settings fit it."""
-    settings, output, _ = await check_job(services, who.name, new.source, new.settings, new.output)
+    settings, output, checked = await check_job(services, who.name, new.source, new.settings, new.output)
     job = await run_in_threadpool(
         services.store.submit,
         source=new.source,
@@ -36,6 +36,7 @@ async def submit_job(new: NewJob, request: Request, response: Response, services
         label=new.label,
         output=output,
         curate=new.curate,
+        content=checked.content,
     )
     services.runner.wake()
     response.headers["Location"] = str(request.url_for("read_job", job_id=job.id).path)

@@ -91,9 +91,12 @@ class Job(PublicJob):
         them.
     lost_tries
         How often its cluster was lost since it last got any further.
+    content
+        A hash of what its movie held when it was submitted; "" of jobs of earlier versions.
     """
 
     lost_tries: int
+    content: str = ""
 
     def to_record(self) -> dict[str, Any]:
         """Return the job as a JSON-ready mapping."""

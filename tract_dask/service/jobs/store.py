@@ -89,6 +89,7 @@ class JobStore:
         label: str = "",
         output: str = "",
         curate: bool = False,
+        content: str = "",
     ) -> Job:
         """Add a job to the queue; without ``output`` it gets a folder of its own under ``jobs``.
 
@@ -102,9 +103,9 @@ class JobStore:
         with self.writing() as db:
             rows.require_sole_output(db, output)
             db.execute(
-                "INSERT INTO jobs (id, label, owner, source, output, settings, curate, state, created)"
-                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (name, label, owner, source, output, json.dumps(settings), curate, State.QUEUED, now),
+                "INSERT INTO jobs (id, label, owner, source, output, settings, curate, state, created, content)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (name, label, owner, source, output, json.dumps(settings), curate, State.QUEUED, now, content),
             )
             rows.record_transition(db, name, "submitted", now)
             return rows.tell(db, name, now)

@@ -84,7 +84,9 @@ CREATE TABLE deletions (
 ) WITHOUT ROWID
 """
 
-MIGRATIONS = (_FIRST, _SECOND, _THIRD)
+_FOURTH = "ALTER TABLE jobs ADD COLUMN content TEXT NOT NULL DEFAULT ''"
+
+MIGRATIONS = (_FIRST, _SECOND, _THIRD, _FOURTH)
 """The steps from each version to the next; a file's version is how many of them it has had."""
 
 _TABLES = frozenset({"jobs", "transitions", "events", "columns", "owners"})

@@ -191,6 +191,7 @@ class JobProcess(Thread):
             "root": str(self._root.path),
             "closed": list(map(str, self._root.permit.closed)),
             "mark": asdict(self._mark),
+            "content": job.content,
             "settings": inside(self._root, job.settings),
             "columns": columns,
             "until": "columns" if job.curate and version is None else None,

@@ -6,6 +6,7 @@ import json
 import threading
 import traceback
 from concurrent.futures import CancelledError
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from time import monotonic
@@ -18,12 +19,15 @@ from distributed.comm import CommClosedError
 from ...cluster.dispatch import JOB
 from ...cluster.retries import persist
 from ...cluster.tls import using
-from ...errors import ClusterError, ExitCode, TractError
+from ...errors import ChangedSourceError, ClusterError, ExitCode, TractError
 from ...progress import Event, Noticed, ShardDone, StageDone, StageStarted, Warned, clock, silent
+from ...readers.checks import Permit
 from ...readers.movie_files import FileList
 from ...run import pipeline
+from ...run.checks import open_input
 from ...settings.run import RunSettings
 from ...settings.toml import from_dict
+from ...stages.convert.origin import origin_of
 from ...store import metadata, run_folder
 from ...store.files import remove, write_aside
 from ..data_root import DataRoot
@@ -125,8 +129,9 @@ def _run_in(
     outputs: run_folder.RunFolder, order: dict[str, Any], root: DataRoot, settings: RunSettings, on_event: Reporter
 ) -> pipeline.RunOutcome:
     """Do what the order says, in the folder that its job has."""
-    columns = order["columns"]
-    run = partial(pipeline.run, _source(order), outputs.root, settings, patience_s=PATIENCE_S, permit=root.permit)
+    columns, source = order["columns"], _source(order)
+    persist(partial(check_content, source, settings, outputs, order["content"], root.permit), on_event, str(source))
+    run = partial(pipeline.run, source, outputs.root, settings, patience_s=PATIENCE_S, permit=root.permit)
     if columns is not None:  # an edited table is one that differs from that of a finished stage
         sink = silent if outputs.columns.exists() else on_event
         run(on_event=sink, until="columns")
@@ -138,6 +143,29 @@ def _source(order: dict[str, Any]) -> str | FileList:
     """Return the movie of an order: a path, or a list of files."""
     files = order["files"]
     return str(order["source"]) if files is None else FileList(order["source"], tuple(map(Path, files)))
+
+
+def check_content(
+    source: str | FileList, settings: RunSettings, outputs: run_folder.RunFolder, content: str, permit: Permit
+) -> None:
+    """Check that a movie still holds what it held when its job was submitted: it was looked at then, and planned.
+
+    Raises
+    ------
+    ChangedSourceError
+        Where it does not.
+    """
+    if not content:  # of a job of an earlier version
+        return
+    with closing(open_input(source, settings, outputs.movie, permit)) as opened:
+        if origin_of(opened).content != content:
+            raise ChangedSourceError(
+                "the movie is not what it was when the job was submitted",
+                str(source),
+                "what it held then",
+                "something else: it was replaced, or written again",
+                "Look at it, and submit a new job if it is the right one",
+            )
 
 
 def place_columns(outputs: run_folder.RunFolder, table: str) -> None:
