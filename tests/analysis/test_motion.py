@@ -158,7 +158,7 @@ def test_change_points_of_still_columns_come_as_often_as_stated(n_frames, n_colu
 
 
 def test_errors_that_follow_the_noise_of_their_frame_raise_no_alarm():
-    """Stated errors scatter by two fifths from frame to frame, as a faint column's do; levels hold within 2 points."""
+    """Errors scatter by two fifths from frame to frame, as a faint column's do; levels hold within 2 points."""
     n_columns = 1500
     rng = np.random.default_rng(4)
     stated = 2.0 * np.exp(0.4 * rng.normal(size=(40, n_columns)))

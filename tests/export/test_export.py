@@ -75,7 +75,7 @@ def check_table(read: pd.DataFrame, tracks: xr.Dataset) -> None:
         np.testing.assert_array_equal(read[f"{name}_stderr"], tracks["stderr"].sel(parameter=name).to_numpy().ravel())
     np.testing.assert_array_equal(read["x_pm"], 4.0 * read["x"])
     np.testing.assert_array_equal(read["drift_y"], np.repeat(tracks["drift"].sel(axis="y").to_numpy(), N_COLUMNS))
-    np.testing.assert_array_equal(read["noise"], np.repeat(tracks["noise"].to_numpy(), N_COLUMNS))
+    np.testing.assert_array_equal(read["noise"], tracks["noise"].to_numpy().ravel())
     np.testing.assert_array_equal(read["accepted"], tracks["status"].to_numpy().ravel() == 0)
     assert set(read["kind"]) == {"Ce"}
     assert set(FULL) <= set(read)

@@ -45,7 +45,7 @@ def make_tracks(n_frames: int = N_FRAMES) -> xr.Dataset:
         "intensity_stderr": np.full_like(intensity, 25.0),
         "status": status,
         "drift": rng.normal(size=(n_frames, 2)),
-        "noise": np.ones(n_frames),
+        "noise": np.ones((n_frames, n)),
         "time": 0.1 * np.arange(n_frames),
         "r_squared": np.full((n_frames, n), 0.9),
     }

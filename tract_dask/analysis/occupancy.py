@@ -18,7 +18,7 @@ from ..kernels.gaussian.intensity import intensities
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE
 from ..settings.run import FitSettings
-from ..store.results import accepted, fitted_with
+from ..store.results import accepted, fitted_with, weakest
 from ..store.schema import Status
 from .intensity import UNIT, normalised
 from .likelihood import CONFIDENCE, Levels, credible_sets, probabilities
@@ -114,7 +114,7 @@ def count_atoms(
     sigma = noise_scale * _sigma(measured, error)
     reference = _reference(tracks, noise_scale)
     expected = xr.DataArray(reference["sigma"] / unit)
-    limit = threshold * good["noise"] * reference["area"] / unit
+    limit = weakest(good, threshold) * reference["area"] / unit
     weak = ((good["status"] & np.uint8(Status.BELOW_NOISE)) != 0) & ((good["status"] & np.uint8(_UNKNOWN)) == 0)
     if frames == "each":
         error_of_each = xr.where(weak, expected, sigma)

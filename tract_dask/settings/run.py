@@ -214,7 +214,7 @@ class FitSettings(Settings):
     )
     threshold: float = setting(
         1.6,
-        "Accept a fit where the amplitude exceeds this times the noise (the paper's 2)",
+        "Accept a fit where the amplitude exceeds this times the noise; the default lets 5 % of empty places pass",
         low=0,
         high=100,
         common=True,

@@ -258,7 +258,9 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     dataset.attrs |= {name: about.get(name) for name in _SCALES}
     dataset.attrs |= part_attributes(about.get("part"))
     settings = from_toml(FitSettings, about["settings"], str(path))
-    dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"])
+    dataset.attrs |= how_fitted(
+        settings, about["window"], about["reference_blur_px"], about.get("threshold_scale", 1.0)
+    )
     return with_source_coordinates(dataset)
 
 
@@ -304,11 +306,14 @@ def _nothing_here(path: Path) -> MissingStoreError:
     )
 
 
-def how_fitted(settings: FitSettings, window_px: int, reference_blur_px: float) -> dict[str, Any]:
+def how_fitted(
+    settings: FitSettings, window_px: int, reference_blur_px: float, threshold_scale: float
+) -> dict[str, Any]:
     """Return what an analysis needs to know of the fits, as attributes of their Dataset.
 
     They are the window's diameter, sigma of the blur that the windows went through and of that of the summed image
-    (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, and the ``intensity_scale``.
+    (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, the ``intensity_scale``, and what scales the
+    threshold.
     """
     return {
         "window_px": window_px,
@@ -317,6 +322,7 @@ def how_fitted(settings: FitSettings, window_px: int, reference_blur_px: float) 
         "shape": settings.shape,
         "estimator": settings.estimator,
         "intensity_scale": settings.intensity_scale,
+        "threshold_scale": float(threshold_scale),
     }
 
 
@@ -347,7 +353,7 @@ def accepted(dataset: xr.Dataset, threshold: float | None = None) -> xr.Dataset:
     dataset
         Results, as :func:`open_results` gives them.
     threshold
-        Smallest amplitude that is believed, in units of the frame's noise; None keeps that of the fit (the paper's 2).
+        Smallest amplitude that is believed, as :func:`weakest` counts it; None keeps that of the fit.
 
     Notes
     -----
@@ -356,7 +362,16 @@ def accepted(dataset: xr.Dataset, threshold: float | None = None) -> xr.Dataset:
     """
     status = dataset["status"]
     if threshold is not None:
-        weak = ~(abs(dataset["fit"].sel(parameter="amplitude", drop=True)) > threshold * dataset["noise"])
+        weak = ~(abs(dataset["fit"].sel(parameter="amplitude", drop=True)) > weakest(dataset, threshold))
         status = (status & ~np.uint8(Status.BELOW_NOISE)) | (weak * np.uint8(Status.BELOW_NOISE))
     good = (status & np.uint8(REJECTED)) == 0
     return dataset.assign({name: dataset[name].where(good) for name in FITTED} | {"status": status})
+
+
+def weakest(dataset: xr.Dataset, threshold: float) -> xr.DataArray:
+    """Return the amplitude (frame, column_id) that a fit must exceed to be accepted.
+
+    It is the noise at the column times the threshold, scaled such that 5 % of places without a column exceed the
+    default threshold in fits with the same settings.
+    """
+    return threshold * float(dataset.attrs.get("threshold_scale", 1.0)) * dataset["noise"]

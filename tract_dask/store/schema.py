@@ -118,7 +118,7 @@ RESULTS = _declare(
     Variable("n_iterations", _COLUMN, "int16", "1", "Iterations of the fit", 0),
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
     Variable("drift_measured", ("frame", "axis"), "float64", "px", "The same, before the columns refined it", _NAN),
-    Variable("noise", ("frame",), "float64", "counts", "Standard deviation in vacuum, after the filter", _NAN),
+    Variable("noise", _COLUMN, "float64", "counts", "Noise of a pixel at the column's level, after the filter", _NAN),
     Variable(
         "time",
         ("frame",),

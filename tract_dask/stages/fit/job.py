@@ -51,6 +51,10 @@ class Job:
     settings: FitSettings
     unit: float = 1.0
     """Counts in the unit that the reference is in."""
+    scale: float = 1.0
+    """Of the threshold: with the default one, 5 % of places without a column pass; :mod:`.empty`."""
+    left_over: float = 1.0
+    """Share of the noise that the residuals of a fit show."""
 
     def save(self, path: Path, movie: Movie, key: str) -> None:
         """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
@@ -69,6 +73,8 @@ class Job:
             vacuum=self.vacuum,
             reference_blur_px=self.reference_blur_px,
             refine_columns=self.refined_by,
+            threshold_scale=self.scale,
+            residual_share=self.left_over,
         )
 
     @classmethod
@@ -88,6 +94,8 @@ class Job:
             reference_blur_px=about["reference_blur_px"],
             refined_by=about["refine_columns"],
             settings=from_toml(FitSettings, about["settings"], str(path)),
+            scale=about["threshold_scale"],
+            left_over=about["residual_share"],
         )
 
     @cached_property

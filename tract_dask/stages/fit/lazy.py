@@ -8,6 +8,7 @@ from ...settings.run import FitSettings
 from ...store import results, schema
 from ...store.movie import Movie
 from ...store.source_pixels import with_source_coordinates
+from .empty import calibrated
 from .job import calibration, prepare
 from .measure import Values, measure
 
@@ -51,7 +52,7 @@ def fit_columns(
     import dask.array as da  # takes its time, and workers do not need it
     from dask import delayed
 
-    job = prepare(movie, columns, drift, settings or FitSettings(), summed=summed)
+    job = calibrated(prepare(movie, columns, drift, settings or FitSettings(), summed=summed))
     sizes = {"frame": movie.n_frames, "column_id": len(job.reference)} | schema.SIZES
     fitted = {name: of for name, of in schema.RESULTS.items() if name not in ("time", "drift_measured")}
 
@@ -67,6 +68,8 @@ def fit_columns(
         dataset[name] = (of.dims, da.concatenate(blocks), of.attributes)
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", movie.times(), schema.RESULTS["time"].attributes)
-    dataset.attrs = calibration(movie) | results.how_fitted(job.settings, job.window_px, job.reference_blur_px)
+    dataset.attrs = calibration(movie) | results.how_fitted(
+        job.settings, job.window_px, job.reference_blur_px, job.scale
+    )
     dataset.attrs |= results.part_attributes(movie.part)
     return with_source_coordinates(dataset)

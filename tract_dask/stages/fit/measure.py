@@ -24,6 +24,7 @@ from .filters import filter_frame
 from .frame_fits import FrameFits
 from .incomplete import cut_raw, fill_near, fit_incomplete
 from .job import Job
+from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 
 Values = dict[str, np.ndarray[Any, Any]]
 
@@ -39,7 +40,7 @@ _AT_BOUND = 1e-9
 """Share of the interval between its bounds within which a parameter is at its bound."""
 
 
-class _Places(NamedTuple):
+class Places(NamedTuple):
     """Where the windows and the vacuum lie in some frames of a movie, from frame ``start`` on."""
 
     start: int
@@ -53,8 +54,9 @@ class _Places(NamedTuple):
     """(frames, 3) first row, first column and side of the square whose noise is measured, if there is vacuum."""
 
     @classmethod
-    def of(cls, movie: Movie, start: int, stop: int, job: Job) -> _Places:
-        drift, shape = job.drift[start:stop], np.array(movie.shape[1:])
+    def of(cls, frame: tuple[int, ...], start: int, stop: int, job: Job) -> Places:
+        """Return where they lie in frames of that shape."""
+        drift, shape = job.drift[start:stop], np.array(frame)
         corner = np.rint(job.reference[None, :, [Y, X]] + drift[:, None]).astype(np.int64) - job.window_px // 2
         outside = np.any((corner < 0) | (corner + job.window_px > shape), axis=-1)
         return cls(start, drift, job.bad[start:stop], corner, outside, _vacuum(job, drift, shape))
@@ -83,20 +85,20 @@ def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Val
     return {name: np.concatenate([values[name] for values in parts]) for name in parts[0]}
 
 
-def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[_Places, Tiles, float]]:
+def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[Places, Tiles, float]]:
     """Yield what lies where, the pixels, and the gain that these still lack: of a layer of tiles, or a whole frame."""
     gain = movie.gain / job.unit
     for start in range(shard.start, shard.stop, movie.layer_frames):
         stop = min(start + movie.layer_frames, shard.stop)
         if not whole:
-            places = _Places.of(movie, start, stop, job)
+            places = Places.of(movie.shape[1:], start, stop, job)
             yield places, movie.read_tiles(start, stop, places.boxes(job)), gain
             continue
         for number, pixels in enumerate(movie.read(start, stop), start):
             filters = job.settings.filters_frames
             frame, lacking = (_filtered(pixels, job.settings, gain), 1.0) if filters else (pixels, gain)
             tiles = Tiles(frame[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
-            yield _Places.of(movie, number, number + 1, job), tiles, lacking
+            yield Places.of(movie.shape[1:], number, number + 1, job), tiles, lacking
 
 
 def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArray[np.float32]:
@@ -106,11 +108,11 @@ def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArra
     return np.where(there, filter_frame(fill_near(frame), settings, gain), np.float32(np.nan))
 
 
-def _measure_frames(places: _Places, tiles: Tiles, gain: float, job: Job) -> Values:
+def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Values:
     """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
-    in_frame = _fit(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
-    noise, precision, empty = _vacuum_noise(places, tiles, gain, in_frame.residual, job)
-    status = _status(in_frame, places, job.settings.threshold * noise)
+    in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
+    noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
+    status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
     drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale)
@@ -123,7 +125,7 @@ def _measure_frames(places: _Places, tiles: Tiles, gain: float, job: Job) -> Val
         "intensity_stderr": INTENSITY_SCALE[job.settings.intensity_scale] * fits.volume_stderr,
         "status": status,
         "presence": fits.strength * precision,
-        "presence_vacuum": empty * precision,
+        "presence_vacuum": empty,
         "r_squared": fits.r_squared,
         "n_iterations": fits.n_iterations,
         "drift": drift,
@@ -131,34 +133,39 @@ def _measure_frames(places: _Places, tiles: Tiles, gain: float, job: Job) -> Val
     }
 
 
-def _vacuum_noise(
-    places: _Places, tiles: Tiles, gain: float, residual: Floats, job: Job
+def _noise(
+    places: Places, tiles: Tiles, gain: float, fits: FrameFits, job: Job
 ) -> tuple[Floats, Floats, NDArray[np.float32]]:
-    """Return the noise (frames), what turns matched filters into strengths (frames, 1), and those of empty places.
+    """Return the noise at the columns, what makes strengths of matched filters, (frames, columns), and those in vacuum.
 
-    Strengths in vacuum (frames, places) are not scaled yet, and NaN where there is no vacuum: the noise is then that of
-    the fits' residuals.
+    Where there is no vacuum, the noise is that of the fits' residuals. Where the level of the vacuum does not tell the
+    columns' noise, it is that of the vacuum, and strengths are NaN. Those in vacuum are (frames, places).
     """
-    blur = job.settings.noise_blur_px
-    empty = np.full((len(residual), SIZES["place"]), np.nan, np.float32)
+    blur, residual, white = job.settings.noise_blur_px, fits.residual, white_noise_left(job.settings.noise_blur_px)
     if places.vacuum is None:
-        noise = _damping(job.settings) * masked_median(residual, np.isfinite(residual))
+        common = damping(job.settings) / job.left_over * masked_median(residual, np.isfinite(residual))
+        known = noise = noise_without_vacuum(common, job.reference, job.settings)
+        empty = np.full((len(residual), SIZES["place"]), np.nan)
     else:
-        squares, share = _squares(tiles, places.vacuum, blur, gain)
+        squares, there = _squares(tiles, places.vacuum, blur, gain)
         with np.errstate(invalid="ignore"):  # pixels of bad frames
-            noise = np.asarray(squares.reshape(len(squares), -1).std(axis=1), dtype=np.float64) / np.sqrt(share)
+            flat = squares.reshape(len(squares), -1)
+            vacuum = Vacuum(flat.std(axis=1, dtype=np.float64) / np.sqrt(there), flat.mean(axis=1, dtype=np.float64))
+        known = noise_at_columns(vacuum, fits.estimates, job.reference, job.settings)
+        noise = np.where(np.isfinite(known), known, vacuum.noise[:, None])
         if job.settings.window_blur_px != blur:
             squares, _ = _squares(tiles, places.vacuum, job.settings.window_blur_px, gain)
-        empty = _empty_strengths(squares, places.start, job)
-    with np.errstate(divide="ignore", invalid="ignore"):  # vacuum without noise
-        return noise, _white_noise_left(blur) / noise[:, None], empty
+        with np.errstate(divide="ignore", invalid="ignore"):
+            empty = _empty_strengths(squares, places.start, job) * (white / vacuum.noise[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):  # frames without noise
+        return noise, white / known, empty.astype(np.float32)
 
 
-def _status(fits: FrameFits, places: _Places, weakest: Floats) -> NDArray[np.uint8]:
-    """Return what speaks against each fit, (frames, columns); ``weakest`` (frames) is the smallest good amplitude."""
+def status_of(fits: FrameFits, places: Places, weakest: Floats) -> NDArray[np.uint8]:
+    """Return what speaks against each fit, (frames, columns); ``weakest``, alike, is the smallest good amplitude."""
     inside, amplitude = ~places.outside, np.abs(fits.estimates[..., AMPLITUDE])
     flags = {
-        Status.BELOW_NOISE: ~(amplitude > weakest[:, None]) & inside & ~(fits.incomplete & np.isnan(amplitude)),
+        Status.BELOW_NOISE: ~(amplitude > weakest) & inside & ~(fits.incomplete & np.isnan(amplitude)),
         Status.NOT_CONVERGED: ~fits.converged & inside,
         Status.AT_BOUND: fits.held & inside,
         Status.SHAPE_AT_BOUND: fits.at_bound & ~fits.held & inside,
@@ -172,7 +179,7 @@ def _status(fits: FrameFits, places: _Places, weakest: Floats) -> NDArray[np.uin
     return status
 
 
-def _fit(places: _Places, tiles: Tiles, gain: float, job: Job) -> FrameFits:
+def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits:
     """Return what the windows give, in their coordinates.
 
     A batch of frames is cut, blurred and fitted at a time, so small that its windows stay in the processor's cache.
@@ -284,18 +291,18 @@ def _disc(size: int) -> NDArray[np.bool_]:
     return np.hypot(offset[:, None], offset) <= size / 2
 
 
-def _damping(settings: FitSettings) -> float:
+def damping(settings: FitSettings) -> float:
     """Return by how much the blur for the noise would still reduce the noise of the windows, which is white if raw."""
     still = settings.window_blur_px < settings.noise_blur_px
-    return _white_noise_left(settings.noise_blur_px) if still else 1.0
+    return white_noise_left(settings.noise_blur_px) if still else 1.0
 
 
-def _white_noise_left(sigma: float) -> float:
+def white_noise_left(sigma: float) -> float:
     """Return the share of white noise's standard deviation that the blur of pixels by ``sigma`` px leaves."""
     return float((gaussian_kernel(sigma) ** 2).sum())
 
 
-def _bounds(places: _Places, job: Job) -> tuple[Floats, Floats, Floats]:
+def _bounds(places: Places, job: Job) -> tuple[Floats, Floats, Floats]:
     """Return start values and bounds, each (frames, columns, 7), in the coordinates of the windows."""
     offset = places.drift[:, None] - places.corner  # from the summed image to the window
     settings, reference = job.settings, job.reference

@@ -24,6 +24,7 @@ from ...store.provenance import processor, widths
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done
+from .empty import calibrated
 from .job import Job, calibration, prepare
 from .join import join
 from .measure import measure
@@ -66,7 +67,7 @@ def fit_movie(
         on_event(StageDone("fit", 0.0, reused=True))
         return FitSummary(**about["summary"])
     if not _goes_on(path, key, on_event):
-        job.save(path, movie, key)
+        calibrated(job).save(path, movie, key)
     journal = Journal(journal_beside(path), key, dict.fromkeys(_COUNTS, ()))
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
