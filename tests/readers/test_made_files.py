@@ -35,7 +35,7 @@ def assert_gives(path: Path, frames: np.ndarray, pixel_pm: float | None = None) 
     assert source.dtype == frames.dtype
     for start, stop in ((0, len(frames)), (0, 1), (2, 4), (len(frames) - 1, len(frames))):
         np.testing.assert_array_equal(source.read(start, stop), frames[start:stop])
-    assert source.metadata.pixel_size_pm == (None if pixel_pm is None else pytest.approx(pixel_pm, rel=1e-6))
+    assert source.metadata.pixel_size_pm == (None if pixel_pm is None else pytest.approx(pixel_pm, rel=1e-12))
     metadata = source.metadata
     source.close()
     return metadata

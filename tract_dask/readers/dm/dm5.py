@@ -13,7 +13,7 @@ from ...errors import SourceError
 from ..checks import DAMAGE, Permit
 from ..hdf5.links import Access, opened
 from .image import COLOURS, COMPLEX, TYPES
-from .tags import Array, Tags
+from .tags import Array, Tags, short
 
 _MOST_TAGS, _DEEPEST, _LONGEST = 50_000, 64, 1 << 16
 
@@ -125,5 +125,5 @@ def _value(group: Any, name: str) -> Any:
     if isinstance(found, np.ndarray) and found.size == 1:
         found = found.reshape(-1)[0]
     if isinstance(found, np.generic):
-        found = found.item()
+        found = short(float(found)) if found.dtype == np.float32 else found.item()
     return found.decode(errors="replace") if isinstance(found, bytes) else found

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
+import numpy as np
+
 from ...errors import SourceError
 from ..checks import open_binary, truncated
 
@@ -153,7 +155,8 @@ class _Walk:
     def _value(self, words: tuple[int, ...]) -> Any:
         kind = words[0]
         if kind in _NUMBERS and len(words) == 1:
-            return struct.unpack(self.order + _NUMBERS[kind], self._take(_SIZES[kind]))[0]
+            found = struct.unpack(self.order + _NUMBERS[kind], self._take(_SIZES[kind]))[0]
+            return short(found) if _NUMBERS[kind] == "f" else found
         if kind == _STRUCT:
             fields = "".join(self._fields(words))
             return struct.unpack(self.order + fields, self._take(struct.calcsize("=" + fields)))
@@ -207,6 +210,17 @@ class _Walk:
         place = f"byte {self.file.tell():,}"
         got = f"{got} at {place}" if got != "" else f"more at {place}"
         return SourceError(what, self.where, expected, got, "The file is damaged: make the copy or the export again")
+
+
+def short(value: float) -> float:
+    """Return a number that was stored in single precision with the digits that it was written with.
+
+    Examples
+    --------
+    >>> short(0.019999999552965164), short(float("inf"))
+    (0.02, inf)
+    """
+    return float(str(np.float32(value)))
 
 
 def below(tags: object, *names: str) -> Tags:
