@@ -2,11 +2,12 @@
 
 H = J^T J, and C is the covariance of the pixels' noise: that of raw pixels, after the blur. So J^T C J is a product of
 blurred Jacobians with the raw pixels' variances as weights. All its sums are of smooth functions, which are sampled as
-coarsely as their width allows. The size of C follows from the residual: its expected sum of squares is the trace of C
-less that of H^-1 (J^T C J), and the trace of C is the raw variance times the sum of the squares of the blur's weights.
+coarsely as their width allows. The errors are those for noise of a known size: a raw pixel's variance is one for each
+count, or one. What the noise's size is follows from the residual: its expected sum of squares is the trace of C less
+that of H^-1 (J^T C J), and the trace of C is the raw variance times the sum of the squares of the blur's weights.
 
-For maximum likelihood H is Fisher's information, and the covariance H^-1 times Pearson's chi-squared per degree of
-freedom.
+For maximum likelihood H is Fisher's information, the covariance is H^-1, and the noise's size is Pearson's chi-squared
+per degree of freedom.
 
 The functions are traced, see :func:`~tract_dask.kernels.vectors.tracing.traced`.
 """
@@ -43,8 +44,10 @@ from .moments import (
 )
 from .steps import BOUND_OF, LOWER, PRODUCTS, ROW_OF, UPPER, assemble, entry, factorise, read, solve, turn_centre
 
-N_ERRORS = 8
-"""Standard errors of a fit: amplitude, x, y, P, S, Q, background, and that of log(volume)."""
+RATIO, FREEDOM, LEVEL, N_ERRORS = 8, 9, 10, 11
+"""Standard errors of a fit: amplitude, x, y, P, S, Q, background, and that of log(volume). Behind them the residual's
+sum of squares over what the noise alone has (the trace of C), the share of that which the fit leaves, and the variance
+of a pixel whose weight in C is 1."""
 
 _MODEL = (KINDS[0], KINDS[2])
 
@@ -60,16 +63,16 @@ class Noise(NamedTuple):
     """Whether a raw pixel's variance is proportional to the model."""
 
 
-def _variance(point: Rows, offset: Vector, counting: Index) -> tuple[Vector, Vector]:
-    """Return (base, contrast): up to a factor, a raw pixel's variance is base + contrast * E.
+def _variance(point: Rows, offset: Vector, counting: Index) -> tuple[Vector, Vector, Vector]:
+    """Return (base, contrast, level): a raw pixel's variance is level * (base + contrast * E), one for each count.
 
-    ``offset`` is what was subtracted from the pixels.
+    Where counts do not tell it, it is 1. ``offset`` is what was subtracted from the pixels.
     """
-    amplitude = point[AMPLITUDE_ROW]
     floor = larger(point[BACKGROUND_ROW] + offset, 0)
+    amplitude = larger(point[AMPLITUDE_ROW], -floor)
     total = absolute(amplitude) + floor
-    usable = (floor + amplitude >= 0) & (total > 0) & (spread(counting) > 0)
-    return select(usable, floor / total, 1), select(usable, amplitude / total, 0)
+    usable = (total > 0) & (spread(counting) > 0)
+    return select(usable, floor / total, 1), select(usable, amplitude / total, 0), select(usable, total, 1)
 
 
 def _noise_sums(grid: Grid, stride: Index, shapes: Any, variance: Any, into: Rows) -> Any:
@@ -174,7 +177,7 @@ def _inverse(hessian: list[Vector], free: list[Vector]) -> tuple[list[list[Vecto
 def standard_errors(
     grid: Grid, stride: Index, point: Rows, sums: Rows, bounds: Rows, scales: Any, noise: Any, part: Rows, errors: Rows
 ) -> None:
-    """Write the standard errors (8,) of LANES fits; NaN where a parameter is held.
+    """Write the errors (N_ERRORS,) of LANES fits, for noise of level 1; NaN where a parameter is held.
 
     ``scales`` are the offset of the pixels, and 0 or 1 for whether the shape is free. ``noise`` is that of least
     squares, or None for maximum likelihood.
@@ -183,12 +186,13 @@ def standard_errors(
     hessian, _, _ = assemble(point, sums)
     free = _free(point, bounds, free_shape, hessian)
     if noise is None:
-        meat, trace = hessian, spread(grid.n_pixels)
+        meat, trace, level = hessian, spread(grid.n_pixels), point[X].of(1)
     else:
         u, v = point[CURVATURE_U], point[CURVATURE_V]
         wide_u, wide_v = u / (1 + u * noise.blur_variance), v / (1 + v * noise.blur_variance)
         shapes = ellipse(point, u, v), ellipse(point, wide_u, wide_v)
-        total = _noise_sums(grid, stride, shapes, _variance(point, offset, noise.counting), part)
+        *variance, level = _variance(point, offset, noise.counting)
+        total = _noise_sums(grid, stride, shapes, variance, part)
         own = read(part, 0, DATA)
         to_axes(own, _MODEL, (point[X], point[Y]), (point[COS], point[SIN], sqrt(u), sqrt(v)))
         own += [total] * (WEIGHT + 1 - DATA)
@@ -198,9 +202,11 @@ def standard_errors(
     for i in range(7):
         for j in range(7):
             freedom = freedom - inverse[i][j] * meat[entry(i, j)]
-    size = select(known & (freedom > 0), larger(sums[MERIT], 0) / freedom, np.nan)
     for i in range(7):
-        errors[i] = select(free[i] > 0, sqrt(_quadratic(meat, inverse[i]) * size), np.nan)
+        errors[i] = select(known & (free[i] > 0), sqrt(_quadratic(meat, inverse[i])), np.nan)
     amplitude = point[AMPLITUDE_ROW]
     volume = [inverse[0][j] / amplitude - 0.5 * (inverse[3][j] + inverse[5][j]) for j in range(7)]
-    errors[7] = sqrt(_quadratic(meat, volume) * size)
+    errors[7] = select(known, sqrt(_quadratic(meat, volume)), np.nan)
+    errors[RATIO] = larger(sums[MERIT], 0) / trace
+    errors[FREEDOM] = select(known & (freedom > 0), freedom / trace, np.nan)
+    errors[LEVEL] = level

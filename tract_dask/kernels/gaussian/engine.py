@@ -16,7 +16,7 @@ from numba import njit
 
 from ..vectors.simd import aligned_rows, number, rows_of
 from ..vectors.tracing import INLINE, LANES, Rows, traced
-from .covariance import N_ERRORS, Noise, standard_errors
+from .covariance import FREEDOM, LEVEL, N_ERRORS, RATIO, Noise, standard_errors
 from .iteration import (
     BOUNDS,
     CONVERGED,
@@ -62,6 +62,7 @@ from .steps import LOWER, N_SYSTEM, UPPER
 AT_BOUND = 1
 _LARGEST = 3e38
 _STRIDE_SIGMA = 1.0
+_STRIDES_ACROSS = 10  # a window, whose edge is as coarse as the stride
 _LOOSE_PX = 0.03  # near enough for the likelihood to be quadratic
 
 
@@ -80,6 +81,10 @@ class Results(NamedTuple):
     """(n,) int16."""
     status: Array
     """(n,) uint8."""
+    noise: Array
+    """(n,) float64."""
+    freedom: Array
+    """(n,) float64."""
 
 
 class Problem(NamedTuple):
@@ -172,7 +177,7 @@ def _stride(row: Array, size: int) -> int:
     """Return how coarsely a fit's Gaussian may be sampled, in px."""
     sigma = 1 / math.sqrt(max(row[POINT + CURVATURE_U], row[POINT + CURVATURE_V]))
     stride = 4 if sigma >= 4 * _STRIDE_SIGMA else 2 if sigma >= 2 * _STRIDE_SIGMA else 1
-    while stride > 1 and size < 4 * stride:
+    while stride > 1 and size < _STRIDES_ACROSS * stride:
         stride //= 2
     return stride
 
@@ -194,7 +199,7 @@ def _write_errors(errors: Array, swapped: bool, factor: float, found: Array, std
     stderr[4] = 0.5 * b * (errors[3] if swapped else errors[5])
     apart, turn = (a - b) * (a + b), float(errors[4])
     if turn == turn:  # not held
-        stderr[5] = min(turn * a * b / apart, 0.5 * math.pi) if apart > 0 else 0.5 * math.pi
+        stderr[5] = turn * a * b / apart if apart > 0 else np.inf
     of_volume[0] = abs(2 * math.pi * found[0] * a * b) * errors[7]
 
 
@@ -296,15 +301,19 @@ def _find_all_errors(frame: Frame, table: Array, noise: Any, out: Array) -> None
 
 
 @njit(**INLINE)
-def _leave_fits(problem: Problem, n_pixels: int, middle: Any, table: Array, errors: Array, results: Results) -> None:
-    """Write what is known of all fits: estimates exactly on the bounds that they are on, how they ended, errors."""
+def _leave_fits(problem: Problem, kind: Any, middle: Any, table: Array, errors: Array, results: Results) -> None:
+    """Write what is known of all fits: estimates exactly on the bounds that they are on, how they ended, errors.
+
+    ``kind`` are the number of pixels that count, and whether a pixel's variance goes with its counts.
+    """
+    n_pixels, counting = kind
     one = 0 if len(problem.lower) == 1 else 1, 0 if len(problem.upper) == 1 else 1
     for n in range(len(table)):
         row, found, outcome = table[n], results.estimates[n], int(table[n, OUTCOME])
         results.status[n], results.n_iterations[n], results.r_squared[n] = outcome, int(row[STEPS]), 0
         for i in range(7):
             results.stderr[n, i] = np.nan
-        results.volume_stderr[n] = np.nan
+        results.volume_stderr[n], results.noise[n], results.freedom[n] = np.nan, np.nan, np.nan
         if row[STEPS] == 0:
             continue
         lower, upper = problem.lower[n * one[0]], problem.upper[n * one[1]]
@@ -335,7 +344,11 @@ def _leave_fits(problem: Problem, n_pixels: int, middle: Any, table: Array, erro
         results.r_squared[n] = min(max(explained, 0.0), 1.0)
         if outcome == CONVERGED:
             results.status[n] = AT_BOUND if at_bound else CONVERGED
+            level = errors[n, LEVEL] * factor if counting else factor * factor
             _write_errors(errors[n], u > v, factor, found, results.stderr[n], results.volume_stderr[n : n + 1])
+            results.stderr[n] *= math.sqrt(level)
+            results.volume_stderr[n] *= math.sqrt(level)
+            results.noise[n], results.freedom[n] = errors[n, RATIO] / level, errors[n, FREEDOM]
 
 
 def _compiled(sources: str) -> Any:
@@ -360,8 +373,8 @@ def _compiled(sources: str) -> Any:
         return sources
 
     @njit(cache=True, nogil=True, error_model="numpy")
-    def leave(problem: Problem, n_pixels: int, middle: Any, table: Array, errors: Array, results: Results) -> str:
-        _leave_fits(problem, n_pixels, middle, table, errors, results)
+    def leave(problem: Problem, kind: Any, middle: Any, table: Array, errors: Array, results: Results) -> str:
+        _leave_fits(problem, kind, middle, table, errors, results)
         return sources
 
     return enter, iterate, find_errors, leave
@@ -383,6 +396,8 @@ def fit_windows(images: Array, problem: Problem, options: Options, noise: Noise)
         np.empty(n, np.float32),
         np.empty(n, np.int16),
         np.empty(n, np.uint8),
+        np.empty(n),
+        np.empty(n),
     )
     pixels, frame = images.reshape(-1), _frame(height, width, options.radius_px)
     table = aligned_rows(n * N_STATE // LANES).reshape(n, N_STATE)
@@ -399,5 +414,5 @@ def fit_windows(images: Array, problem: Problem, options: Options, noise: Noise)
         _iterate(pixels, frame, table, limits, likelihood)
     errors = np.empty((n, N_ERRORS), np.float32)
     _find_errors(frame, table, None if options.poisson else noise, errors)
-    _leave(problem, frame.sides[2], middle, table, errors, results)
+    _leave(problem, (frame.sides[2], options.poisson or noise.counting), middle, table, errors, results)
     return -1, results

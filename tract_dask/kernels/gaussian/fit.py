@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..windows import gaussian_kernel
 from .covariance import Noise
 from .engine import Options, Problem, fit_windows
+from .parameters import THETA
 
 __all__ = ["LARGEST_SIGMA", "SMALLEST_SIGMA_PX", "GaussianFits", "Outcome", "fit_gaussians"]
 
@@ -51,6 +52,18 @@ class GaussianFits(NamedTuple):
     """(n,) steps tried."""
     status: npt.NDArray[np.uint8]
     """(n,) codes of :class:`Outcome`."""
+    noise: npt.NDArray[np.float64]
+    """(n,) the residual's sum of squares over what the noise alone would have, if a raw pixel's variance were one for
+    each count (or one, without ``counting``); NaN where the fit has not converged."""
+    freedom: npt.NDArray[np.float64]
+    """(n,) share of the noise's sum of squares that a fit leaves; NaN where a small window leaves nothing to tell."""
+
+    def with_noise(self, size: npt.ArrayLike) -> GaussianFits:
+        """Return fits whose errors are for noise of size 1 with those for noise of this size, (n,) or one for all."""
+        factor = np.sqrt(np.broadcast_to(np.asarray(size, np.float64), self.noise.shape))
+        stderr = self.stderr * factor[:, None]
+        stderr[:, THETA] = np.minimum(stderr[:, THETA], math.pi / 2)
+        return self._replace(stderr=stderr, volume_stderr=self.volume_stderr * factor)
 
     @property
     def converged(self) -> npt.NDArray[np.bool_]:
@@ -76,6 +89,7 @@ def fit_gaussians(
     tolerance_px: float = 1e-4,
     max_iterations: int = 50,
     radius_px: float = math.inf,
+    own_noise: bool = True,
 ) -> GaussianFits:
     """Fit Equation 1 to each window within bounds.
 
@@ -96,7 +110,7 @@ def fit_gaussians(
         The Gaussian blur that the windows have been through, which correlates their noise; enters the standard errors.
     counting
         Whether a raw pixel's noise variance is proportional to the model, as for counted electrons, and not the same in
-        every pixel; enters the standard errors of ``lsq``. The noise's size is always taken from the residuals.
+        every pixel; enters the standard errors of ``lsq``.
     tolerance_px
         A fit has converged when an undamped step moves the centre by less than this, and the outline of the ellipse by
         less than ten times this.
@@ -104,6 +118,9 @@ def fit_gaussians(
         Most steps that are tried on a window.
     radius_px
         Pixels farther than this from the window's middle pixel (h // 2, w // 2) do not count.
+    own_noise
+        Whether the noise's size in the standard errors is that of the window's own residual, ``noise / freedom``. Off:
+        it is 1, a variance of one for each count (or one, without ``counting``).
 
     Returns
     -------
@@ -137,7 +154,8 @@ def fit_gaussians(
     if empty >= 0:
         low, high = (np.broadcast_to(values, (n, 7))[empty].tolist() for values in (lowers, uppers))
         raise ValueError(f"bounds of window {empty} are empty: lower {low}, upper {high}")
-    return GaussianFits(*results)
+    fits = GaussianFits(*results)
+    return fits.with_noise(fits.noise / fits.freedom) if own_noise else fits
 
 
 def _rows(values: npt.ArrayLike, n: int) -> npt.NDArray[np.float64]:

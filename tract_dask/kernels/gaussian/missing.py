@@ -61,11 +61,11 @@ def widening(
         whole, left = (_covariance(slopes, weights * part, noise) for part in (np.ones(x.size), known))
         if whole is None or left is None:
             continue
-        ratio = np.sqrt(np.maximum(left.diagonal() / whole.diagonal(), 1.0) * x.size / known.sum())
+        ratio = np.sqrt(np.maximum(left.diagonal() / whole.diagonal(), 1.0))
         factors[k] = ratio[4:].max(initial=1.0)
         factors[k, list(_FREE)] = ratio[:4]
         of_volume = (by_volume @ left @ by_volume) / (by_volume @ whole @ by_volume)
-        volume[k] = np.sqrt(max(of_volume, 1.0) * x.size / known.sum())
+        volume[k] = np.sqrt(max(of_volume, 1.0))
     return factors, volume
 
 

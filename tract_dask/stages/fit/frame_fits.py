@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.intensity import Floats
-from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
+from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, THETA, X, Y
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,8 @@ class FrameFits:
     Standard errors are NaN after a filter of whole frames: there is no theory of its noise. A fit is ``held`` where a
     bound other than that of a sigma is active, and ``incomplete`` where pixels of its window are missing. Centroids are
     (y, x); strengths are those of the matched filters. Residuals (rms) are NaN where there is vacuum, and so no need of
-    them.
+    them; their ratio is that of the sums of squares to what noise of size 1 has. Standard errors are for noise of size
+    1 until :meth:`with_noise`.
     """
 
     estimates: Floats
@@ -34,6 +35,7 @@ class FrameFits:
     centroid: Floats
     strength: Floats
     residual: Floats
+    ratio: Floats
     incomplete: NDArray[np.bool_]
 
     @classmethod
@@ -44,12 +46,19 @@ class FrameFits:
 
     def without(self, outside: NDArray[np.bool_], bad: NDArray[np.bool_]) -> FrameFits:
         """Return the same with NaN for windows ``outside`` (frames, columns), and for centroids of ``bad`` frames."""
-        names = ("estimates", "stderr", "volume_stderr", "r_squared", "centroid", "strength", "residual")
+        names = ("estimates", "stderr", "volume_stderr", "r_squared", "centroid", "strength", "residual", "ratio")
         blank: dict[str, Any] = {name: vars(self)[name].copy() for name in names}
         for values in blank.values():
             values[outside] = np.nan
         blank["centroid"][bad] = np.nan
         return replace(self, **blank, n_iterations=self.n_iterations * ~outside)
+
+    def with_noise(self, size: Floats) -> FrameFits:
+        """Return the same with the standard errors that noise of this size (frames,) makes."""
+        factor = np.sqrt(size)[:, None]
+        stderr = self.stderr * factor[..., None]
+        stderr[..., THETA] = np.minimum(stderr[..., THETA], np.pi / 2)
+        return replace(self, stderr=stderr, volume_stderr=self.volume_stderr * factor)
 
     def moved(self, offset: NDArray[Any]) -> FrameFits:
         """Return the same with positions moved by ``offset`` in (y, x), (frames, columns or 1, 2)."""

@@ -123,7 +123,9 @@ def fit_incomplete(
     fits.stderr[:] *= grown
     fits.volume_stderr[:] *= np.where(lost, np.nan, volume)
     fits.strength[:] /= grown[:, AMPLITUDE]
-    fits.residual[:] *= np.sqrt(disc.sum() / np.maximum(inner[:, disc].sum(axis=1), 1))
+    share = disc.sum() / np.maximum(inner[:, disc].sum(axis=1), 1)  # what was filled has no residual
+    fits.residual[:] *= np.sqrt(share)
+    fits.ratio[:] *= share
     return fits, missing, lost
 
 

@@ -27,6 +27,7 @@ from ...store.provenance import provenance
 from ...store.strangers import MOVIE_KEY
 from ..columns.window_size import neighbour_distance, resolve_window
 from ..pixel_range import check_pixels
+from .noise_size import WindowNoise, window_noise
 from .vacuum import check_box, find_vacuum
 
 
@@ -125,6 +126,11 @@ class Job:
     def filters(self) -> Filters:
         """The matched filter of each column, by which it is told whether it is there."""
         return matched_filters(self.reference, self.window_px, self.settings.window_blur_px)
+
+    @cached_property
+    def window_noise(self) -> WindowNoise:
+        """What each column's window does with noise."""
+        return window_noise(self.reference, self.window_px, self.settings)
 
     @cached_property
     def in_units(self) -> Job:

@@ -25,6 +25,7 @@ from .frame_fits import FrameFits
 from .incomplete import cut_raw, fill_near, fit_incomplete
 from .job import Job
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
+from .noise_size import frame_noise
 
 Values = dict[str, np.ndarray[Any, Any]]
 
@@ -111,6 +112,8 @@ def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArra
 def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Values:
     """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
+    good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None])
+    in_frame = in_frame.with_noise(frame_noise(in_frame.ratio, good, job.window_noise.left, job.window_noise.degrees))
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
     status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
     drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
@@ -247,9 +250,13 @@ def _fit_windows(
         max_iterations=settings.max_iterations,
         radius_px=job.window_px / 2,
         counting=settings.counting,
+        own_noise=False,
     )
-    if settings.filters_frames:
-        fits.stderr[:], fits.volume_stderr[:] = np.nan, np.nan
+    fits.stderr[:] *= np.nan if settings.filters_frames else job.window_noise.errors[which]
+    fits.volume_stderr[:] *= np.nan if settings.filters_frames else job.window_noise.volume[which]
+    if settings.shape == "free":  # a sigma on its bound moves amplitude and background by more than they scatter
+        fits.stderr[fits.at_bound, AMPLITUDE] = fits.stderr[fits.at_bound, BACKGROUND] = np.nan
+        fits.volume_stderr[fits.at_bound] = np.nan
     held, residual = np.zeros(len(windows), np.bool_), np.full(len(windows), np.nan)
     for k in (AMPLITUDE, X, Y, BACKGROUND):
         low, high, value = lower[:, k], upper[:, k], fits.estimates[:, k]
@@ -270,6 +277,7 @@ def _fit_windows(
         _centroids(windows, start, which, job),
         strengths(windows, job.filters, which).astype(np.float64),
         residual,
+        fits.noise,
         np.zeros(len(windows), np.bool_),
     )
 
