@@ -84,6 +84,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "binning": [],
         "greys": [],
         "changepoints": [],
+        "hops": [],
         "peaks": [],
         "rendering": [],
         "total_variation": [],

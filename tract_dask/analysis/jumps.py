@@ -16,6 +16,7 @@ from ..kernels.changepoints import gains, plateaus
 from ..kernels.gaussian.intensity import Floats
 from ..store import schema
 from .motion import frame_times, named, positions, standard_errors
+from .rates import hop_rates
 from .weights import blocks, drawn_together, scatter_of
 
 _PARTS = 64
@@ -156,7 +157,12 @@ def noise_factor(tracks: xr.Dataset) -> xr.Dataset:
 
 
 def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -> xr.Dataset:
-    """Return how often each column jumps, with the exact interval for a Poisson process (Garwood 1936).
+    """Return how often each column jumps, with an interval.
+
+    Jumps of :func:`change_points` are those that a test is sure of; a column that hops fast, or by little, makes more.
+    Its rate comes from a hidden Markov model of two sites (:mod:`tract_dask.analysis.rates`). Jumps of another table,
+    and those of a column that is on more than two sites, are counted, with the exact interval for a Poisson process
+    (Garwood 1936).
 
     Parameters
     ----------
@@ -172,8 +178,16 @@ def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -
     Returns
     -------
     Dataset
-        Over column_id: ``n`` jumps, their ``rate`` and its interval from ``low`` to ``high``, in 1/s; NaN for a column
-        that was not seen in two frames.
+        Over column_id: ``n`` jumps of the table, the ``rate`` and its interval from ``low`` to ``high``, in 1/s; NaN
+        for a column that was not seen in two frames. ``counted``, whether the rate is a count. ``smallest``, in pm: a
+        column may hop by less, unseen (two standard errors of a place; NaN where jumps were counted). Jumps between one
+        frame and the next count once.
+
+    Notes
+    -----
+    The interval of the model is that of equal tails under Jeffreys' prior. On made columns that hop by two or more
+    errors with probabilities of 0.02 to 0.4 a frame, 95 % intervals hold the truth in 95 to 99 % of 40 frames. Where a
+    movie cannot tell, they are wide: 0.005 to 0.2 a frame for a column that shows no hop in 40 frames.
 
     Raises
     ------
@@ -188,11 +202,20 @@ def jump_rate(jumps: xr.Dataset, tracks: xr.Dataset, confidence: float = 0.95) -
     time = np.where(watched > 0, watched, np.nan)
     tail = (1 - confidence) / 2
     low, high = np.where(n > 0, gammaincinv(np.maximum(n, 1), tail), 0.0), gammainccinv(n + 1, tail)
+    rates = np.stack([n / time, low / time, high / time], axis=1)
+    smallest, counted = np.full(len(n), np.nan), np.ones(len(n), np.bool_)
+    if "shortest" in jumps.attrs:
+        of_model, smallest = hop_rates(tracks, confidence)
+        counted = np.isnan(of_model[:, 0])
+        of_model[:, 0] = np.where((n == 0) & (of_model[:, 1] == 0), 0.0, of_model[:, 0])
+        rates, smallest = np.where(counted[:, None], rates, of_model), np.where(counted, np.nan, smallest)
     found = {
-        "rate": (n / time, "1/s", "Jumps for each second"),
-        "low": (low / time, "1/s", f"Lower end of the {confidence:.0%} interval of the rate"),
-        "high": (high / time, "1/s", f"Upper end of the {confidence:.0%} interval of the rate"),
+        "rate": (rates[:, 0], "1/s", "Jumps for each second"),
+        "low": (rates[:, 1], "1/s", f"Lower end of the {confidence:.0%} interval of the rate"),
+        "high": (rates[:, 2], "1/s", f"Upper end of the {confidence:.0%} interval of the rate"),
         "n": (n, "1", "Jumps"),
+        "counted": (counted, "1", "Whether the rate is that of the jumps in the table"),
+        "smallest": (smallest, "pm", "Smallest hop that counts"),
     }
     columns = {"column_id": tracks["column_id"]}
     return xr.Dataset(
