@@ -120,7 +120,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         ],
         "checks": ["data_root", "jobs", "outputs", "job_settings", "services"],
         "pages": ["auth", "services"],
-        "error_handlers": ["data_root", "jobs", "errors", "pages"],
+        "error_handlers": ["crashes", "data_root", "jobs", "errors", "pages"],
         "api": [
             "data_root",
             "jobs",

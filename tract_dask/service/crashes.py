@@ -1,14 +1,16 @@
-"""Files that a reader dies on, or does not come to an end with: what is said of them, and for how long it holds."""
+"""Files that a reader dies on, or that a disk does not give: what is said of them, and for how long it holds."""
 
 from __future__ import annotations
 
+import os
 import signal
 from collections import OrderedDict
 from pathlib import Path
 from time import monotonic
 
 from ..cluster.deaths import CRASHES
-from ..errors import InputError
+from ..cluster.retries import Place, trouble
+from ..errors import InputError, MissingStoreError, StoreError, TractError
 
 _CRASHES = CRASHES | {signal.SIGFPE}
 """A process that does nothing but read this file, and divides by zero, does so by the file."""
@@ -99,3 +101,27 @@ def _key(file: str) -> tuple[str, int, int] | None:
     except (OSError, ValueError):
         return None
     return None if place.is_dir() else (file, status.st_size, status.st_mtime_ns)
+
+
+class UnreachableError(StoreError):
+    """A disk, or the system, did not give a file; it may at the next try."""
+
+
+def of_system(error: BaseException) -> TractError | None:
+    """Return what an error of the system, or one that comes of it, means to who asks; None for all others.
+
+    What passes is no fault of a file, whatever a reader made of it.
+    """
+    if isinstance(error, ConnectionError | TimeoutError):  # of a client, say
+        return None
+    met = trouble(error, Place(), "a file of the service")
+    if met is not None and met.passes:
+        got, remedy = os.strerror(met.number), "Try again in a while; where that does not help, its disk needs a look"
+        return UnreachableError("a file cannot be reached now", met.where, got=got, remedy=remedy)
+    if not isinstance(error, OSError) or not error.errno:
+        return None
+    where = str(error.filename or "a file of the service")
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return MissingStoreError("the file is not there any more", where, remedy="Look again what is there")
+    remedy = "Correct the permissions, or free some space, where the service runs"
+    return UnreachableError("the service cannot use a file", where, got=os.strerror(error.errno), remedy=remedy)

@@ -17,6 +17,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Match
 
 from ..errors import TractError
+from .crashes import of_system
 from .data_root import DataRoot
 from .errors import answer, body, invalid
 from .jobs.tables import store_error
@@ -43,6 +44,7 @@ class ErrorHandlers:
         """Let the application answer in this way."""
         app.add_exception_handler(TractError, self._tract_error)
         app.add_exception_handler(sqlite3.Error, self.unexpected)
+        app.add_exception_handler(OSError, self._of_system)
         app.add_exception_handler(RequestValidationError, _invalid)
         app.add_exception_handler(HTTPException, _http)
 
@@ -55,9 +57,15 @@ class ErrorHandlers:
         )
         return _as_asked(request, JSONResponse(body(problem), HTTPStatus.INTERNAL_SERVER_ERROR))
 
+    def _of_system(self, request: Request, error: Exception) -> Response:
+        found = of_system(error)
+        if found is None:
+            raise error
+        return self._tract_error(request, found)
+
     def _tract_error(self, request: Request, error: Exception) -> Response:
         assert isinstance(error, TractError)
-        found = answer(error, self._root)
+        found = answer(of_system(error) or error, self._root)
         if found.status_code >= HTTPStatus.INTERNAL_SERVER_ERROR:
             log.warning("%s %s: %s", request.method, request.url.path, error)
         return _as_asked(request, found)

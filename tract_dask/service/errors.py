@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from starlette.responses import JSONResponse
 
 from ..errors import ClusterError, InputError, MissingStoreError, StoreError, TractError
-from .crashes import CrashError, ExhaustedError
+from .crashes import CrashError, ExhaustedError, UnreachableError
 from .data_root import DataRoot, OutsideError
 from .jobs.records import ConflictError, UnknownJobError, UnknownVersionError
 from .jobs.tables import JobStoreError
@@ -49,6 +49,7 @@ STATUS: dict[type[TractError], int] = {
     CrashError: 422,
     ExhaustedError: 422,
     JobStoreError: 503,
+    UnreachableError: 503,
     ClusterError: 503,
     InputError: 400,
     StoreError: 500,
@@ -87,7 +88,7 @@ ERRORS: dict[int | str, dict[str, Any]] = {
         "description": "A field is missing or invalid, or a file makes its reader crash.",
     },
     500: {"model": ErrorBody, "description": "The service failed."},
-    503: {"model": ErrorBody, "description": "The cluster does not answer, or the job store cannot be used."},
+    503: {"model": ErrorBody, "description": "The cluster, the job store or a disk does not answer now."},
 }
 """What every route of the API may answer with, for its OpenAPI document."""
 

@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 
 from ..cluster.forkserver import THREAD_VARIABLES, uncollected
 from ..errors import ClusterError, TractError
-from .crashes import Blamed, CrashError, ExhaustedError, crash_of, crashed, exhausted, unending
+from .crashes import Blamed, CrashError, ExhaustedError, crash_of, crashed, exhausted, of_system, unending
 
 T = TypeVar("T")
 
@@ -418,8 +418,8 @@ def _answered(task: bytes, limit: int) -> tuple[Exception | int | None, bytes]:
     except Exception as error:  # noqa: BLE001 (the worker goes on)
         if _is_starved(error):
             return limit, b""
-        if isinstance(error, TractError):
-            return error, b""
+        if isinstance(error, TractError | OSError) and (found := of_system(error) or error):
+            return found, b""
         return RuntimeError(f"in the process pool:\n{format_exc()}"), b""
 
 

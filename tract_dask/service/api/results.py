@@ -136,6 +136,8 @@ def read_report(job_id: JobId, services: Served) -> Response:
         raise MissingStoreError(
             "there is no report", place.parent.name, "the job to be done", remedy="Wait until the job is done"
         )
+    with place.open("rb"):  # before the answer begins: a disk that does not give it is an error, and no empty page
+        pass
     headers = {"Content-Security-Policy": _REPORT_POLICY, "Cache-Control": "private, no-cache"}
     return FileResponse(place, media_type="text/html; charset=utf-8", headers=headers)
 

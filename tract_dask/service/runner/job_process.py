@@ -20,7 +20,7 @@ from ...progress import RunState
 from ...readers.movie_files import FileList
 from ...settings.cluster import ClusterSettings
 from ...settings.toml import to_dict
-from ..crashes import crash_of, crashed
+from ..crashes import UnreachableError, crash_of, crashed, of_system
 from ..data_root import DataRoot
 from ..job_settings import inside
 from ..jobs.records import Job, utc_now
@@ -142,8 +142,10 @@ class JobProcess(Thread):
             end = self._try()
         except (ClusterError, sqlite3.Error) as error:  # the store's disk may be full, or slow
             end = self._lost(str(error))
-        except TractError as error:
-            end = Ending(State.FAILED, str(error))
+        except (TractError, OSError) as error:
+            found = of_system(error) or error
+            passes = isinstance(found, UnreachableError)
+            end = self._lost(str(found)) if passes else Ending(State.FAILED, str(found))
         except Exception as error:  # noqa: BLE001  the last resort: no job may stay behind as running
             _log.exception("job %s", self._job.id)
             end = Ending(State.FAILED, f"unexpected {type(error).__name__}: {error}")

@@ -87,8 +87,12 @@ class Runner:
         while not self._stopping.is_set():
             try:
                 self._fill()
-            except sqlite3.Error:  # a full disk, say: the next look may go well
-                _log.exception("the job store cannot be used")
+            except (
+                sqlite3.Error,
+                OSError,
+                RuntimeError,
+            ):  # a full disk, say: the next look may go well
+                _log.exception("the queue cannot be looked at now")
             self._awake.wait(_LOOK_S)
             self._awake.clear()
 
