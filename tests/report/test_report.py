@@ -78,7 +78,7 @@ class Run:
         self.values["time"][:] = 0.1 * np.arange(N_FRAMES)
         self.folder, self.columns = folder, columns
         self.about = {"pixel_size_pm": PIXEL_PM, "frame_time_s": 0.1, "dose": 500.0} | about
-        self.settings = RunSettings()
+        self.settings, self.quality = RunSettings(), None
         self.found = {"contrast": "bright", "contrast_rival": 0.01, "lattice_px": 30.0, "spacing_px": 30.0}
 
     def write(self):
@@ -99,6 +99,9 @@ class Run:
         )
         stored = {name: values for name, values in self.values.items() if name not in ("time", "drift_measured")}
         store_fits(path, stored, N_FRAMES)
+        if self.quality is not None:
+            drift = xr.Dataset({"quality": ("frame", self.quality), "drift": (("frame", "axis"), self.scene.drift)})
+            datasets.write_dataset(drift, self.folder / "drift.zarr")
         found = self.columns.assign_attrs(self.found)
         datasets.write_dataset(found, self.folder / "columns.zarr")
         summed = self.scene.summed()
@@ -234,6 +237,11 @@ def _odd_column(run):
     run.columns["fit_ref"][1, 0] *= 0.5
 
 
+def _lost_frames(run):
+    run.values["status"][[4, 5]] = Status.LOST_FRAME
+    run.quality = np.where(np.isin(np.arange(N_FRAMES), [4, 5]), 0.0, 0.8)
+
+
 def _contrast_not_sure(run):
     run.found["contrast_rival"] = 0.7
 
@@ -255,6 +263,7 @@ def _columns_too_near(run):
     ("change", "expected"),
     [
         (_contrast_not_sure, {"contrast"}),
+        (_lost_frames, {"lost_frames"}),
         (_doubtful, {"doubtful_columns"}),
         (_columns_too_far_apart, {"spacing"}),
         (_columns_too_near, {"spacing"}),

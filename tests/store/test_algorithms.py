@@ -44,7 +44,7 @@ def groups_of(settings: RunSettings) -> dict[str, Settings]:
         (("convert", "content", {}), "f79bd03caceef8a7d56899cc6c298d531463fb2e49e5060fdb213a1a923fcf57"),
         (
             ("drift", "movie", {"drift.search_px": 12}),
-            "2dd84dd5e218d2a581d13bf124317e8fdee0fff7669bd382efb139e2291f5a35",
+            "6e82a44a53fe7f88b90b53ad8a671558e8ad998b37ba1fcec8ff526a2448ba87",
         ),
         (("sum", "movie", {}, 1.0, NUMBERS), "fbfd7e26e3758c4a56d18b6c341a303c6d7f6df213a6c917b015eeb68e85878b"),
         (

@@ -20,7 +20,7 @@ from ..stages.fit.job import prepare
 from ..stages.fit.measure import Values, measure
 from ..store import files
 from ..store.movie import Movie
-from ..store.schema import Status
+from ..store.schema import NOT_SEEN, Status
 from ..store.shards import Shard
 
 FILTERS = ("none", "gaussian", "wiener", "tv-l1")
@@ -123,7 +123,7 @@ def _check_known(what: str, wanted: Sequence[int], known: Sequence[int], expecte
 def _frame_rows(values: Values) -> xr.Dataset:
     """Return what the table needs of the fits of one frame, over (column_id)."""
     raw = values["fit"][0, :, [X, Y]] + values["drift"][0, ::-1, None]
-    failed = (values["status"][0] & (Status.NOT_CONVERGED | Status.OUTSIDE_FRAME | Status.BAD_FRAME)) > 0
+    failed = (values["status"][0] & (Status.NOT_CONVERGED | NOT_SEEN)) > 0
     numbers = {
         "r_squared": (values["r_squared"][0], "1"),
         "x": (raw[0], "px"),

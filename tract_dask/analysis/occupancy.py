@@ -19,7 +19,7 @@ from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE
 from ..settings.run import FitSettings
 from ..store.results import accepted, fitted_with, weakest
-from ..store.schema import Status
+from ..store.schema import NOT_SEEN, Status
 from .intensity import UNIT, normalised
 from .likelihood import CONFIDENCE, Levels, credible_sets, probabilities
 from .lookup import intensity_bound, look_up_table, read_table, write_table
@@ -27,7 +27,6 @@ from .motion import pixel_size_pm, standard_deviation
 
 __all__ = ["count_atoms", "dose_to_be_sure", "look_up_table", "read_table", "write_table"]
 
-_UNKNOWN = Status.OUTSIDE_FRAME | Status.BAD_FRAME
 _ALIKE = 0.1
 """Windows and blurs of table and tracks may differ by this share."""
 _WINDOW_SLOPE = 0.5
@@ -115,7 +114,7 @@ def count_atoms(
     reference = _reference(tracks, noise_scale)
     expected = xr.DataArray(reference["sigma"] / unit)
     limit = weakest(good, threshold) * reference["area"] / unit
-    weak = ((good["status"] & np.uint8(Status.BELOW_NOISE)) != 0) & ((good["status"] & np.uint8(_UNKNOWN)) == 0)
+    weak = ((good["status"] & np.uint8(Status.BELOW_NOISE)) != 0) & ((good["status"] & np.uint8(NOT_SEEN)) == 0)
     if frames == "each":
         error_of_each = xr.where(weak, expected, sigma)
         inputs: tuple[Any, ...] = (intensity, error_of_each, limit, weak, xr.ones_like(intensity))

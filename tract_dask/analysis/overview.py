@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.gaussian.parameters import AMPLITUDE, X, Y
-from ..store.schema import REJECTED, Status
+from ..store.schema import NOT_SEEN, REJECTED, Status
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -21,7 +21,6 @@ Flags = NDArray[np.bool_]
 QUANTITIES = ("x", "y", "intensity")
 SERIES = (*QUANTITIES, *(f"{name}_stderr" for name in QUANTITIES))
 FRAME = ("fits", "accepted", "bad", "amplitude", "drift_y", "drift_x")
-_NOT_FITTED = Status.OUTSIDE_FRAME | Status.BAD_FRAME
 _FLAGS = ("below_noise", "not_converged", "at_bound", "shape_at_bound")
 COUNTS = ("fits", "accepted", "outside", *_FLAGS)
 MEANS = ("x", "y", "intensity", "r_squared", "variance")
@@ -137,7 +136,7 @@ class Part:
     def __init__(self, opened: Callable[[str], Any], start: int, stop: int) -> None:
         found = {name: np.asarray(opened(name)[start:stop]) for name in _READ}
         fit, stderr, self._status = found["fit"], found["stderr"], found["status"]
-        self._fitted, self._accepted = ((self._status & int(flags)) == 0 for flags in (_NOT_FITTED, REJECTED))
+        self._fitted, self._accepted = ((self._status & int(flags)) == 0 for flags in (NOT_SEEN, REJECTED))
         self._r_squared, self._amplitude, self._drift = found["r_squared"], fit[..., AMPLITUDE], found["drift"]
         own, errors = (fit, "intensity"), (stderr, "intensity_stderr")
         self.series: Floats = np.stack(

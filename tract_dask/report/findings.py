@@ -203,7 +203,16 @@ def _frames(run: Survey) -> Iterator[Finding]:
         which = f"{count(int(bad.sum()), 'frame')} ({named(frames[bad].tolist())})"
         text = f"{which} show nothing: all pixels are equal, or most are missing."
         yield Finding("bad_frames", "Frames could not be fitted", text, "Look at them in the movie.")
-    poor = ~bad & (run.frames["share"].to_numpy() < HALF)
+    lost = _lost(run) & ~bad
+    if lost.any():
+        text = (
+            f"{count(int(lost.sum()), 'frame')} ({named(frames[lost].tolist())}) do not resemble the others: the "
+            "crystal is away, out of focus, or farther than the search. Their drift is interpolated, and no fit of "
+            "them is accepted."
+        )
+        remedy = "Look at them in the movie. Is the crystal there, give --drift-csv or a larger --drift-search-px."
+        yield Finding("lost_frames", "Frames are lost", text, remedy)
+    poor = ~bad & ~lost & (run.frames["share"].to_numpy() < HALF)
     if poor.any():
         text = (
             f"In {count(int(poor.sum()), 'frame')} ({named(frames[poor].tolist())}) fewer than half of the fits were "
@@ -211,6 +220,14 @@ def _frames(run: Survey) -> Iterator[Finding]:
         )
         remedy = "Is the specimen blurred, out of focus, or out of sight there?"
         yield Finding("poor_frames", "Some frames are worse than the others", text, remedy)
+
+
+def _lost(run: Survey) -> NDArray[np.bool_]:
+    """Return which frames could not be registered."""
+    if "quality" not in run.frames:
+        return np.zeros(run.frames.sizes["frame"], np.bool_)
+    quality = run.frames["quality"].to_numpy()
+    return np.asarray((quality == 0) & (quality > 0).any())
 
 
 def _flags(run: Survey) -> Iterator[Finding]:
@@ -285,7 +302,7 @@ def _drift(run: Survey) -> Iterator[Finding]:
         yield Finding("long_step", "The drift jumps", text, "Look at these frames, or give the drift (--drift-csv).")
     if "quality" in run.frames:
         quality = run.frames["quality"].to_numpy()
-        poor = quality < POOR_QUALITY * np.nanmedian(quality)
+        poor = (quality < POOR_QUALITY * np.nanmedian(quality)) & ~_lost(run)
         if poor.any():
             text = (
                 f"{count(int(poor.sum()), 'frame')} ({named(run.frames['frame'].to_numpy()[poor].tolist())}) resemble "

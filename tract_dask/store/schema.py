@@ -33,7 +33,8 @@ class Status(enum.IntFlag):
 
     ``AT_BOUND`` is about position, amplitude and background. ``SHAPE_AT_BOUND`` is about the sigmas alone: the position
     is then the best one for a column of that shape, and is accepted. ``INCOMPLETE`` is a window in which pixels are
-    missing: the fit is to those that are there, its errors say what is lost, and it is accepted.
+    missing: the fit is to those that are there, its errors say what is lost, and it is accepted. ``LOST_FRAME`` is one
+    that does not resemble the others, for the crystal is away or out of focus: its drift is interpolated.
     """
 
     OK = 0
@@ -44,9 +45,13 @@ class Status(enum.IntFlag):
     BAD_FRAME = 16
     SHAPE_AT_BOUND = 32
     INCOMPLETE = 64
+    LOST_FRAME = 128
 
 
-REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | Status.OUTSIDE_FRAME | Status.BAD_FRAME
+NOT_SEEN = Status.OUTSIDE_FRAME | Status.BAD_FRAME | Status.LOST_FRAME
+"""With any of these flags the frame does not show the column's place: whether it is there is not known."""
+
+REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | NOT_SEEN
 """A fit with any of these flags is not accepted."""
 
 STATUS_ATTRIBUTES = {
@@ -146,7 +151,7 @@ DRIFT = _declare(
         ("frame",),
         "float64",
         "1",
-        "Correlation of the shifted frame with the reference, 0 to 1",
+        "Correlation of the shifted frame with the reference, 0 to 1; 0 where it does not resemble it",
         _NAN,
     ),
 )

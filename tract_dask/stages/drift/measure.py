@@ -69,6 +69,11 @@ _SAMPLES, _SAMPLE_FRAMES = 4, 2
 _FEWEST_PARTS, _PART_FRAMES = 8, 64
 
 _TRUST = 0.5
+"""Share of the usual resemblance below which a frame is not believed."""
+
+_FAINT, _BEYOND = 0.05, 6.0
+"""A frame is lost that shows less than this share of the structure's usual power, and whose quality is more than so
+many standard deviations below the usual."""
 
 _MEMORY = 16
 
@@ -169,11 +174,14 @@ def measure_drift(
         payloads = stage.run(partial(_refine_shard, movie, level, follow.path, refine.path), shards, refine)
         found = np.concatenate([np.array(payloads[shard.index]["drift"]) for shard in shards])
         quality = np.concatenate([np.array(payloads[shard.index]["quality"]) for shard in shards])
+        quality[lost_frames(quality)] = 0.0
         drift = _fill(_on_one_scale(found, track, shards), quality > 0.0)
         if not (quality > 0.0).any():
             on_event(Warned("no frame shows a structure to measure drift by; drift is taken as zero"))
         drift = level.bin * (drift - np.median(drift, axis=0))
-        stage.end(f"largest {np.abs(drift).max():.1f} px, median quality {np.median(quality):.2f}")
+        held = int((quality == 0).sum())
+        lost = f", {held} frames lost" if held else ""
+        stage.end(f"largest {np.abs(drift).max():.1f} px, median quality {np.median(quality):.2f}{lost}")
     return drift_dataset(
         drift,
         quality,
@@ -279,7 +287,7 @@ class _Follower:
     def __init__(self, level: Level) -> None:
         self.fold, self.reach = level.search_fold, level.search / level.search_fold
         self.sum = _MovingSum((level.shape[0] // self.fold, level.shape[1] // self.fold))
-        self.empty = True
+        self.empty, self.is_sure = True, True
         self._recent: deque[float] = deque(maxlen=_MEMORY)
 
     def follow(self, small: Image, guess: Floats) -> tuple[Floats, float]:
@@ -288,7 +296,8 @@ class _Follower:
         if not self.empty:
             dy, dx, score = search(small, self.sum.total, tuple(shift - self.sum.origin), self.reach)
             shift = np.array([dy, dx]) + self.sum.origin
-            if self._recent and score < _TRUST * np.median(self._recent):
+            self.is_sure = not self._recent or bool(score >= _TRUST * np.median(self._recent))
+            if not self.is_sure:
                 return guess, score
             self._recent.append(score)
         self.sum.add(small, _whole(shift))
@@ -351,7 +360,10 @@ def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], 
         guess = last - drift[first] if track.trusted.any() else np.zeros(2)
         small = fold_image(total / np.float32(max(1.0, exposure.max())), level.search_fold)
         offset, _ = follower.follow(small, guess)
-        offsets[shard.index], last = offset, offset + drift[final]
+        offsets[shard.index] = offset
+        if not follower.is_sure:  # a part without crystal: what its frames seem to do leads nowhere
+            continue
+        last = offset + drift[final]
         track.drift[here], track.placed[here], track.trusted[here] = drift + offset, placed, trusted
     track.drift = _fill(track.drift, track.trusted)
     zero = np.rint(np.median(track.drift, axis=0))
@@ -404,6 +416,24 @@ def _on_one_scale(found: Floats, track: Track, shards: Sequence[Shard]) -> Float
     own = np.add.reduceat(left, [shard.start for shard in shards])
     own = np.repeat(own, [shard.frames for shard in shards], axis=0)
     return found - own / max(1, int(track.trusted.sum()))
+
+
+def lost_frames(quality: Floats) -> Bools:
+    """Return which frames do not resemble the others: where the crystal is away, out of focus, or beyond the search.
+
+    A quality of q means that q^2 / (1 - q^2) times the noise's power is structure. A frame must have a twentieth of
+    what is usual, or a quality within six standard deviations of it: at a low dose quality scatters by itself.
+
+    Examples
+    --------
+    >>> lost_frames(np.array([0.81, 0.8, 0.05, 0.79, 0.8, 0.0])).tolist()
+    [False, False, True, False, False, True]
+    """
+    usual = np.median(quality[quality > 0.0]) if (quality > 0.0).any() else 0.0
+    spread = np.median(np.abs(quality - usual)) / 0.6745
+    power = quality**2 / np.maximum(1 - quality**2, 1e-6)
+    faint = power < _FAINT * usual**2 / max(1 - usual**2, 1e-6)
+    return np.asarray(faint & (quality < usual - _BEYOND * spread))
 
 
 def _fill(drift: Floats, good: Bools) -> Floats:

@@ -32,8 +32,9 @@ def estimate_drift(
     """Return the drift of every frame, (frame, axis) in px, zero at its median, and a quality for each frame.
 
     Quality is Pearson's correlation of the filtered frame with the filtered mean of all other parts of the movie, cut
-    to 0..1; it falls with the dose. It is 0 where a frame holds nothing to register (all NaN, or constant); the drift
-    of such a frame is interpolated. For methods csv and none it is 1.
+    to 0..1; it falls with the dose. It is 0 where a frame holds nothing to register (all NaN, or constant) or does
+    not resemble the others (:func:`.measure.lost_frames`); the drift of such a frame is interpolated, and it is not
+    part of the sum. For methods csv and none it is 1.
 
     Parameters
     ----------

@@ -56,6 +56,8 @@ class Job:
     """Of the threshold: with the default one, 5 % of places without a column pass; :mod:`.empty`."""
     left_over: float = 1.0
     """Share of the noise that the residuals of a fit show."""
+    lost: tuple[int, ...] = ()
+    """Frames that could not be registered."""
 
     def save(self, path: Path, movie: Movie, key: str) -> None:
         """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
@@ -76,6 +78,7 @@ class Job:
             refine_columns=self.refined_by,
             threshold_scale=self.scale,
             residual_share=self.left_over,
+            lost=list(self.lost),
         )
 
     @classmethod
@@ -97,6 +100,7 @@ class Job:
             settings=from_toml(FitSettings, about["settings"], str(path)),
             scale=about["threshold_scale"],
             left_over=about["residual_share"],
+            lost=tuple(about["lost"]),
         )
 
     @cached_property
@@ -170,7 +174,14 @@ def prepare(
         reference_blur_px=columns.attrs.get("blur_sigma_px", settings.blur_sigma_px),
         refined_by=settings.refine_columns if settings.refine_drift and measured else None,
         settings=settings,
+        lost=_lost(drift),
     )
+
+
+def _lost(drift: xr.Dataset | None) -> tuple[int, ...]:
+    """Return the frames whose drift could not be measured; none where it was for no frame, and is zero."""
+    quality = np.ones(1) if drift is None else drift["quality"].to_numpy()
+    return tuple(np.flatnonzero((quality == 0) & (quality > 0).any()).tolist())
 
 
 def check_counts(smallest: Floats) -> None:

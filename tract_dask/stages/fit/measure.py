@@ -47,6 +47,7 @@ class Places(NamedTuple):
     start: int
     drift: Floats
     bad: NDArray[np.bool_]
+    lost: NDArray[np.bool_]
     corner: NDArray[np.int64]
     """(frames, columns, 2) first row and column of each window."""
     outside: NDArray[np.bool_]
@@ -60,7 +61,8 @@ class Places(NamedTuple):
         drift, shape = job.drift[start:stop], np.array(frame)
         corner = np.rint(job.reference[None, :, [Y, X]] + drift[:, None]).astype(np.int64) - job.window_px // 2
         outside = np.any((corner < 0) | (corner + job.window_px > shape), axis=-1)
-        return cls(start, drift, job.bad[start:stop], corner, outside, _vacuum(job, drift, shape))
+        lost = np.isin(np.arange(start, stop), job.lost) & ~job.bad[start:stop]
+        return cls(start, drift, job.bad[start:stop], lost, corner, outside, _vacuum(job, drift, shape))
 
     def boxes(self, job: Job) -> NDArray[np.int64]:
         """Return what is needed of the frames, as :meth:`Movie.read_tiles` takes it."""
@@ -127,7 +129,7 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
         "intensity_error": intensity_error,
         "intensity_stderr": INTENSITY_SCALE[job.settings.intensity_scale] * fits.volume_stderr,
         "status": status,
-        "presence": fits.strength * precision,
+        "presence": np.where(places.lost[:, None], np.nan, fits.strength * precision),
         "presence_vacuum": empty,
         "r_squared": fits.r_squared,
         "n_iterations": fits.n_iterations,
@@ -175,6 +177,7 @@ def status_of(fits: FrameFits, places: Places, weakest: Floats) -> NDArray[np.ui
         Status.INCOMPLETE: fits.incomplete & inside & ~places.bad[:, None],
         Status.OUTSIDE_FRAME: places.outside,
         Status.BAD_FRAME: places.bad[:, None],
+        Status.LOST_FRAME: places.lost[:, None],
     }
     status = np.zeros(inside.shape, np.uint8)
     for flag, found in flags.items():

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -140,8 +141,9 @@ def fit_key(movie: Movie, job: Job) -> str:
     """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
     arrays = (job.reference, job.drift, job.columns["column_id"].to_numpy().astype(np.int64))
     vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
-    numbers = [movie.gain, int(job.window_px), vacuum, job.refined_by]
+    numbers: list[Any] = [movie.gain, int(job.window_px), vacuum, job.refined_by]
     kinds = [str(kind) for kind in job.columns["kind"].to_numpy()]
+    numbers += [list(job.lost)] if job.lost else []
     return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
 
 
