@@ -15,6 +15,9 @@ from tract_dask.store.columns import column_dataset
 PULL = 0.05
 """Errors in units of the stated ones have a root mean square this near to 1, of 1500 fits."""
 
+UNIFORM = 0.06
+"""Largest distance of p-values' distribution from a uniform one, 1500 fits (their scatter alone makes 0.035)."""
+
 SIGMA = 0.15
 """Of a column, in units of the spacing."""
 
@@ -28,8 +31,13 @@ class Row(NamedTuple):
     settings: dict[str, Any]
 
 
-def fitted(row: Row, folder: Path, side: int = 5, fits: int = 1500) -> tuple[xr.Dataset, np.ndarray]:
-    """Fit columns that jitter by 0.2 px by themselves; return the fits and where the columns are."""
+def fitted(
+    row: Row, folder: Path, side: int = 5, fits: int = 1500, beside: dict[int, float] | None = None
+) -> tuple[xr.Dataset, np.ndarray]:
+    """Fit columns that jitter by 0.2 px by themselves; return the fits and where the columns are.
+
+    ``beside`` are numbers of columns that have another one of half their height, so many px to the right.
+    """
     rng, sigma = np.random.default_rng(int(row.spacing)), SIGMA * row.spacing
     line = (np.arange(side) + 1.25) * row.spacing
     sites = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + 0.37
@@ -37,6 +45,9 @@ def fitted(row: Row, folder: Path, side: int = 5, fits: int = 1500) -> tuple[xr.
     along = np.arange(int((side + 1.5) * row.spacing))
     across, down = (np.exp(-0.5 * ((along - places[..., k, None]) / sigma) ** 2) for k in (0, 1))
     expected = row.background + row.height * np.einsum("fcy,fcx->fyx", down, across)
+    for column, aside in (beside or {}).items():
+        shifted = np.exp(-0.5 * ((along - places[:, column, 0, None] - aside) / sigma) ** 2)
+        expected += 0.5 * row.height * np.einsum("fy,fx->fyx", down[:, column], shifted)
     np.save(folder / "movie.npy", rng.poisson(expected).astype("u2"))
     movie = open_movie(convert(folder / "movie.npy", folder / "movie.zarr"))
     truth = np.array([[row.height, x, y, sigma, sigma, 0, row.background] for x, y in sites])
@@ -67,6 +78,32 @@ def test_errors_of_places_and_intensities_are_as_stated(row, tmp_path):
     of_intensity = (intensity - intensity.mean()) / fits["intensity_stderr"].to_numpy()
     assert np.sqrt((pulls**2).mean()) == pytest.approx(1, abs=PULL)
     assert np.sqrt((of_intensity**2).mean()) == pytest.approx(1, abs=1.5 * PULL)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        Row(24, *BRIGHT, {"blur_sigma_px": 1.44}),
+        Row(36, *DARK, {}),
+        Row(24, 3.0, 1.0, {"filter": "none"}),
+        Row(24, 3.0, 1.0, {"estimator": "poisson"}),
+    ],
+    ids=str,
+)
+def test_p_values_of_true_gaussians_are_uniform(row, tmp_path):
+    fits, _ = fitted(row, tmp_path)
+    found = np.sort(fits["p_value"].to_numpy().ravel())
+    assert np.abs(found - (np.arange(found.size) + 0.5) / found.size).max() < UNIFORM
+    assert (found < 0.001).mean() < 0.006
+
+
+def test_p_values_tell_a_column_that_is_two(tmp_path):
+    """A second column of half the height, two sigmas aside, which the table does not know."""
+    row, aside = Row(24, *BRIGHT, {"blur_sigma_px": 1.44}), 2 * SIGMA * 24
+    fits, _ = fitted(row, tmp_path, beside={6: aside, 18: aside})
+    share = (fits["p_value"] < 0.01).mean("frame").to_numpy()
+    assert share[[6, 18]].min() > 0.9
+    assert np.delete(share, [6, 18]).max() < 0.15
 
 
 def test_a_free_shape_on_its_bound_states_no_error_of_its_intensity(tmp_path):

@@ -25,7 +25,7 @@ from .frame_fits import FrameFits
 from .incomplete import cut_raw, fill_near, fit_incomplete
 from .job import Job
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
-from .noise_size import frame_noise
+from .noise_size import frame_noise, p_values
 
 Values = dict[str, np.ndarray[Any, Any]]
 
@@ -115,7 +115,8 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
     """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
     good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None])
-    in_frame = in_frame.with_noise(frame_noise(in_frame.ratio, good, job.window_noise.left, job.window_noise.degrees))
+    size = frame_noise(in_frame.ratio, good, job.window_noise.left, job.window_noise.degrees)
+    in_frame, unknown = in_frame.with_noise(size), in_frame.incomplete | job.settings.filters_frames
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
     status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
     drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
@@ -132,6 +133,7 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
         "presence": np.where(places.lost[:, None], np.nan, fits.strength * precision),
         "presence_vacuum": empty,
         "r_squared": fits.r_squared,
+        "p_value": np.where(unknown, np.float32(np.nan), p_values(in_frame.ratio, size, job.window_noise)),
         "n_iterations": fits.n_iterations,
         "drift": drift,
         "noise": job.unit * noise,

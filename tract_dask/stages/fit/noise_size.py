@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincc
 
 from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.information import model_slopes
@@ -29,7 +30,7 @@ FEWEST_DEGREES = 10.0
 """The size of the noise is not taken from fewer degrees of freedom."""
 
 _WIDTHS = 16
-_LARGEST_PX = 41
+_LARGEST_PX = 31
 """Degrees of freedom are counted in a window no larger than this: a larger one is shrunk, with all that is in it."""
 
 
@@ -47,12 +48,19 @@ class WindowNoise(NamedTuple):
     degrees
         Effective degrees of freedom of a window: twice the squared mean of its residual's sum of squares over its
         variance.
+    level
+        (columns,) mean counts of a pixel; infinite where the noise is not that of counts.
+    grain
+        By how much the squares of counts scatter more than those of a normal distribution: the share of the variance
+        of a sum of squares, times the electrons in a pixel.
     """
 
     errors: Floats
     volume: Floats
     left: Floats
     degrees: float
+    level: Floats
+    grain: float
 
 
 def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowNoise:
@@ -72,11 +80,17 @@ def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowN
     some[:, [X, Y]] = size // 2
     nearest = np.abs(np.log(width[:, None] / width[chosen])).argmin(axis=1)
     degrees = _degrees(some[len(some) // 2], size, settings)
+    counts = np.array([evaluate(column, *_places(size)).mean() for column in some])[nearest]
+    level = (
+        np.maximum(counts, 0) if settings.counting or settings.estimator == "poisson" else np.full_like(counts, np.inf)
+    )
+    kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
+    grain = (kernel @ kernel) ** 4 / (2 * (np.convolve(kernel, kernel) ** 2).sum() ** 2)
     if settings.estimator == "poisson":
         free = 4 if settings.shape == "fixed" else 7
         share = 1 - free / np.count_nonzero(_disc(size))
         ones = np.ones((len(reference), 7))
-        return WindowNoise(ones, ones[:, 0], share * ones[:, 0], degrees)
+        return WindowNoise(ones, ones[:, 0], share * ones[:, 0], degrees, level, grain)
     exact = [_exact(column, size, settings) for column in some]
     bounds = np.full(7, np.inf)
     images = evaluate(some, np.arange(size), np.arange(size)[:, None]).astype(np.float32)
@@ -96,7 +110,7 @@ def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowN
         volume = np.array([volume for _, volume, _ in exact]) / stated.volume_stderr
     errors, volume = np.where(errors > 0, errors, 1.0), np.where(volume > 0, volume, 1.0)
     left = np.array([left for _, _, left in exact])
-    return WindowNoise(errors[nearest], volume[nearest], left[nearest], degrees)
+    return WindowNoise(errors[nearest], volume[nearest], left[nearest], degrees, level, grain)
 
 
 def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, degrees: float) -> Floats:
@@ -126,6 +140,38 @@ def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, degrees: f
     return size
 
 
+def p_values(ratio: Floats, size: Floats, noise: WindowNoise) -> NDArray[np.float32]:
+    """Return how probable so large a residual is where one Gaussian is all that there is, (frames, columns).
+
+    Parameters
+    ----------
+    ratio
+        (frames, columns) the residuals' sums of squares over what the noise alone has.
+    size
+        (frames,) of the noise, from :func:`frame_noise`.
+
+    Returns
+    -------
+    NDArray
+        The upper tail of chi-squared; uniform from 0 to 1 where the model is right. NaN where the noise is not known.
+
+    Notes
+    -----
+    A count of mean m has the excess kurtosis 1 / m, which leaves so much fewer degrees of freedom.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        electrons = noise.level / size[:, None]
+        degrees = noise.degrees / (1 + noise.grain / electrons)
+        squares = degrees * ratio / (size[:, None] * np.where(noise.left > 0, noise.left, np.nan))
+    return np.asarray(gammaincc(degrees / 2, squares / 2), np.float32)
+
+
+def _places(size: int) -> tuple[Floats, Floats]:
+    """Return x and y of the pixels that count, (n,)."""
+    y, x = np.nonzero(_disc(size))
+    return x.astype(np.float64), y.astype(np.float64)
+
+
 def _disc(size: int) -> NDArray[np.bool_]:
     offset = np.arange(size) - size // 2
     return np.hypot(offset[:, None], offset) <= size / 2
@@ -142,8 +188,7 @@ def _spread(size: int, kernel: Floats) -> Floats:
 def _exact(column: Floats, size: int, settings: FitSettings) -> tuple[Floats, float, float]:
     """Return standard errors (7,) and that of the volume for noise of size 1, and the share of it that a fit leaves."""
     fixed, disc = settings.shape == "fixed", _disc(size)
-    y, x = np.nonzero(disc)
-    _, slopes, by_volume = model_slopes(column, x.astype(float), y.astype(float), fixed_shape=fixed)
+    _, slopes, by_volume = model_slopes(column, *_places(size), fixed_shape=fixed)
     scale = np.sqrt((slopes**2).sum(axis=1))
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
     spread, power = _spread(size, kernel), _spread(size, kernel**2)
@@ -171,12 +216,12 @@ def _degrees(column: Floats, size: int, settings: FitSettings) -> float:
     small = column.copy()
     small[[SIGMA_A, SIGMA_B]] /= shrink
     small[[X, Y]] = side // 2
-    y, x = np.nonzero(_disc(side))
-    _, slopes, _ = model_slopes(small, x.astype(float), y.astype(float), fixed_shape=settings.shape == "fixed")
+    _, slopes, _ = model_slopes(small, *_places(side), fixed_shape=settings.shape == "fixed")
     basis = np.linalg.qr((slopes / np.sqrt((slopes**2).sum(axis=1))[:, None]).T)[0]
     kernel = gaussian_kernel(settings.window_blur_px / shrink).astype(np.float64)
     twice = np.pad(np.convolve(kernel, kernel), (side, side))
     middle = twice.size // 2
+    y, x = np.nonzero(_disc(side))
     noise = twice[middle + y[:, None] - y] * twice[middle + x[:, None] - x]
     left = noise - basis @ (basis.T @ noise)
     left -= (left @ basis) @ basis.T
