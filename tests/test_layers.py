@@ -86,6 +86,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "changepoints": [],
         "hops": [],
         "peaks": [],
+        "noise": [],
         "rendering": [],
         "total_variation": [],
     },

@@ -31,6 +31,8 @@ class MemoryMovie:
     frames_per_shard: int = 1000
     bins: tuple[int, ...] = ()
     gain: float = 1.0
+    offset: float = 0.0
+    summed: int = 1
     pixel_size_pm: float | None = 10.0
     key: str = "key"
     path: Path = Path("memory")

@@ -46,7 +46,7 @@ def groups_of(settings: RunSettings) -> dict[str, Settings]:
             ("drift", "movie", {"drift.search_px": 12}),
             "6e82a44a53fe7f88b90b53ad8a671558e8ad998b37ba1fcec8ff526a2448ba87",
         ),
-        (("sum", "movie", {}, 1.0, NUMBERS), "fbfd7e26e3758c4a56d18b6c341a303c6d7f6df213a6c917b015eeb68e85878b"),
+        (("sum", "movie", {}, 1.0, NUMBERS), "14634a3c6ebfb845ece7161128c551f0d352218b59ddddd6c6a4673159ccb9f5"),
         (
             ("columns", NUMBERS, {"columns.contrast": "dark", "fit.window_px": 21.0}, b"x,y\n1,2\n"),
             "a537ee1fac878bab66363189edef3a96648a0a1ce88ab1824d0eb699f577decb",

@@ -79,6 +79,7 @@ def rebin_frames(movie: Movie, n: int, drift: xr.Dataset | None = None) -> Summe
         frame_time_s=None if movie.frame_time_s is None else n * movie.frame_time_s,
         dose=None if movie.dose is None else n * movie.dose,
         gain=movie.gain,
+        offset=n * movie.offset,
         source=movie,
         n=n,
         shift=shift.reshape(-1, 2),
@@ -109,6 +110,11 @@ class SummedFrames(Movie):
     n: int
     shift: NDArray[np.int64] = field(compare=False, repr=False)
     drift: xr.Dataset | None = field(compare=False, repr=False)
+
+    @property
+    def summed(self) -> int:
+        """Frames of the camera in a frame of this movie."""
+        return self.n * self.source.summed
 
     def __reduce__(self) -> tuple[Callable[..., Movie], tuple[Any, ...]]:
         return partial(SummedFrames, **{item.name: getattr(self, item.name) for item in fields(self)}), ()

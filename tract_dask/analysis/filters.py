@@ -15,7 +15,7 @@ from ..errors import SettingsError
 from ..kernels.gaussian.parameters import X, Y
 from ..settings.run import FitSettings
 from ..stages.fit.common_motion import CERTAIN
-from ..stages.fit.filters import filter_frame
+from ..stages.fit.filters import above_offset, filter_frame
 from ..stages.fit.job import prepare
 from ..stages.fit.measure import Values, measure
 from ..store import files
@@ -210,7 +210,7 @@ def filtered_region(
         low, high = float(places.min()) - margin, float(places.max()) + margin
         low, high = (low, high) if np.isfinite(low + high) else (0.0, float(length))
         spans.append(slice(max(0, round(low)), min(length, round(high) + 1)))
-    pixels = movie.read(frame, frame + 1)[0]
+    pixels = above_offset(movie.read(frame, frame + 1)[0], movie.offset)
     images = [
         filter_frame(pixels, dataclasses.replace(settings, estimator="lsq", filter=name), movie.gain)[tuple(spans)]
         for name in FILTERS

@@ -53,7 +53,7 @@ def with_scale(tracks: xr.Dataset, scale: str) -> xr.Dataset:
     tracks = accepted(tracks)
     fits = tracks["fit"]
     both = xr.apply_ufunc(
-        partial(intensities, scale=scale),
+        partial(intensities, scale=scale, dark_variance=tracks.attrs.get("dark_variance", 0.0)),
         fits.chunk({"parameter": -1}) if fits.chunks else fits,
         input_core_dims=[["parameter"]],
         output_core_dims=[[], []],
@@ -354,7 +354,7 @@ def _levels(movie: Movie, box: tuple[int, int, int, int], shift: NDArray[np.int6
                 for frame, (dy, dx) in zip(block, moved, strict=True)
             ]
         )
-        return movie.gain * _mean(boxes)
+        return movie.gain * (_mean(boxes) - [movie.offset, 0.0])
 
     both = da.map_blocks(
         of_shard,

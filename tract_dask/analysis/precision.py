@@ -184,7 +184,9 @@ def cramer_rao(tracks: xr.Dataset) -> xr.DataArray:
 
     Notes
     -----
-    Counts are detector units times ``gain``: the bound holds where a count is an electron. Least squares sees blurred
+    Counts are detector units above ``offset`` times ``gain``: the bound holds where a count is an electron. Read noise
+    counts where it was measured. How far the detector spreads an electron does not: what is wider than that spread
+    can be seen as well as without it. Least squares sees blurred
     pixels, and so, at the rim, those up to a blur beyond the window; and neighbours disturb the model. So a fit can
     come out some per cent below the bound, the more so where few are accepted.
     """
@@ -193,7 +195,8 @@ def cramer_rao(tracks: xr.Dataset) -> xr.DataArray:
     places = column[:, [X, Y]]
     column[:, [X, Y]] -= np.rint(places) - window_px // 2
     fixed = fitted_with(tracks, "shape") == "fixed"
-    bounds = column_bounds(column, window_px, radius_px=window_px / 2, fixed_shape=fixed)
+    dark = tracks.attrs.get("dark_variance", 0.0)
+    bounds = column_bounds(column, window_px, radius_px=window_px / 2, fixed_shape=fixed, dark_variance=dark)
     return _of_columns(tracks, np.sqrt((bounds.x + bounds.y) / 2) * pixel_size_pm(tracks), _COMPARED["crlb"])
 
 

@@ -140,7 +140,7 @@ def _in_frame(one: xr.Dataset, movie: Movie, frame: int | None, column_id: int) 
         raise SettingsError("the column was not fitted here", "plot_fit", "a fit", f"column {column_id}, frame {frame}")
     row, column = (max(0, int(np.rint(fit[k])) - reach) for k in (Y, X))
     rows, columns = (slice(start, start + 2 * reach + 1) for start in (row, column))
-    pixels = movie.read(number, number + 1, rows, columns)[0] * np.float32(movie.gain)
+    pixels = movie.counts(movie.read(number, number + 1, rows, columns)[0])
     return _window(pixels, (column, row), fit, one.attrs, sigma, column_id)
 
 

@@ -147,7 +147,7 @@ def _frame(
     (top, bottom), (left, right) = spans
     rows, columns = slice(max(0, top - reach), bottom + reach), slice(max(0, left - reach), right + reach)
     if bottom > top and right > left:
-        pixels = blur(movie.read(frame, frame + 1, rows, columns)[0] * np.float32(movie.gain), sigma)
+        pixels = blur(movie.counts(movie.read(frame, frame + 1, rows, columns)[0]), sigma)
         part = pixels[top - rows.start : bottom - rows.start, left - columns.start : right - columns.start]
         y, x = top - whole[0] - box[0], left - whole[1] - box[2]
         image[y : y + part.shape[0], x : x + part.shape[1]] = part

@@ -159,11 +159,18 @@ def overridden(found: SourceMetadata, said: MetadataSettings, declared: SourceSe
     if said.dose is not None:
         known = replace(known, dose=said.dose)
     if said.gain != MetadataSettings().gain:
-        known = replace(known, gain=said.gain)
+        known = replace(known, gain=number_of(said.gain, known.gain))
+    if said.offset != MetadataSettings().offset:
+        known = replace(known, offset=number_of(said.offset, 0.0) * declared.bin**2)
     if said.frame_time_s is None:
         return known
     known = replace(known, frame_time_s=said.frame_time_s * frame_step(declared))
     return known if "time" not in known.along_frames or has_stamps(known) else _without_stamps(known)
+
+
+def number_of(said: float | str, until_measured: float) -> float:
+    """Return a setting that is a number; what stands for it until it is measured where it is ``auto``."""
+    return until_measured if isinstance(said, str) else said
 
 
 def _without_stamps(known: SourceMetadata) -> SourceMetadata:

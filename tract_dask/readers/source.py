@@ -81,6 +81,8 @@ class SourceMetadata:
         Electron dose of one frame in e/A^2.
     gain
         Electron counts for one detector unit.
+    offset
+        Detector units of a pixel without electrons.
     notes
         Sentences that the user should read, such as one on a gap in a sequence.
     start_s
@@ -98,6 +100,7 @@ class SourceMetadata:
     frame_time_s: float | None = None
     dose: float | None = None
     gain: float = 1.0
+    offset: float = 0.0
     notes: tuple[str, ...] = ()
     start_s: float | None = None
     along_frames: Mapping[str, FrameValues] = field(default_factory=dict)

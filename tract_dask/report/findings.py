@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..store.camera import ATTRIBUTE, Camera
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
+from .camera import camera_findings
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -67,7 +69,7 @@ class Finding:
 
 def findings(run: Survey) -> list[Finding]:
     """Return what there is to know of a run, warnings first."""
-    checks = (_mixed, _calibration, _found, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
+    checks = (_mixed, _calibration, _camera, _found, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
     found = [finding for check in checks for finding in check(run)]
     return sorted(found, key=lambda finding: not finding.serious)
 
@@ -118,6 +120,16 @@ def _calibration(run: Survey) -> Iterator[Finding]:
         text = "The movie does not say how long a frame lasts, so time is counted in frames."
         remedy = "Run the same command again with --frame-time-s."
         yield Finding("frame_time", "The frame time is not known", text, remedy, serious=False)
+
+
+def _camera(run: Survey) -> Iterator[Finding]:
+    if ATTRIBUTE not in run.summed.attrs:
+        return
+    said = {"gain": 1.0, "offset": 0.0} | run.about["movie"]
+    image = run.summed["image"].to_numpy()[run.summed["exposure"].to_numpy() > 0]
+    level = float(np.median(image)) / said["gain"] + said["offset"] if image.size else 0.0
+    for words in camera_findings(Camera.of(run.summed.attrs), said["gain"], said["offset"], level):
+        yield Finding("camera", **words)
 
 
 def _found(run: Survey) -> Iterator[Finding]:

@@ -88,7 +88,7 @@ def check_pixels_of(movie: Movie, settings: FitSettings) -> None:
     SettingsError
         Where the estimator needs counts, and a pixel is negative.
     """
-    if settings.estimator == "poisson":
+    if settings.estimator == "poisson" and movie.offset == 0:
         check_counts(movie.statistics()["frame_min"].to_numpy())
 
 

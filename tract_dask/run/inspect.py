@@ -17,6 +17,7 @@ from ..readers.source import SourceMetadata
 from ..readers.times import has_stamps
 from ..settings.run import RunSettings
 from ..store import datasets, metadata, schema
+from ..store.camera import Camera
 from ..store.movie import open_movie
 from ..store.results import open_results, part_in_words
 from ..store.run_folder import STORES, RunFolder
@@ -55,6 +56,7 @@ def _source(path: str, settings: RunSettings) -> dict[str, Any]:
             "frame time, s": known.frame_time_s,
             "dose, e/A^2": known.dose,
             "gain": known.gain,
+            "offset, detector units": known.offset,
             **_along_frames(known),
             **{f"{kind} reference": str(file) for kind, file in known.references.items()},
             "notes": list(known.notes),
@@ -87,6 +89,7 @@ def _movie(path: Path) -> dict[str, Any]:
         "frame time, s": movie.frame_time_s,
         "dose, e/A^2": movie.dose,
         "gain": movie.gain,
+        "offset, detector units": movie.offset,
         "shards": len(movie.shards),
         "binned levels": list(movie.bins),
         "frames with pixels that are missing": int(missing.sum()),
@@ -125,6 +128,7 @@ def _sum(path: Path) -> dict[str, Any]:
         "columns of pixels": summed.sizes["x"],
         "frames": summed.attrs.get("n_frames"),
         "pixel size, pm": summed.attrs.get("pixel_size_pm"),
+        **Camera.of(summed.attrs).in_words(),
     }
 
 

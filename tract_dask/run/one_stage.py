@@ -110,6 +110,7 @@ def run_fit(
     with Session(str(movie), path, settings.cluster, client, on_event) as session:
         attempt, workers, send = session.attempt, session.workers, session.send
         summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), workers, send))
+        opened = open_movie(movie)  # its gain and offset may have been measured
         csv = path.with_name(f"{path.stem}_columns.csv")
         found = attempt(partial(columns_stage, summed, csv, chosen, settings.fit, send, draw=draw_columns))
         return attempt(partial(fit_stage, opened, found, shift, summed, path, settings.fit, workers, send))

@@ -31,7 +31,7 @@ from ..stages.sum import sum_stage
 from ..store import files, metadata
 from ..store.held import is_held
 from ..store.journal import journal_beside, remove_journal
-from ..store.movie import Movie
+from ..store.movie import Movie, open_movie
 from ..store.run_folder import RunFolder, sole_run
 from .checks import check_inputs, check_output, check_pixels_of, check_stage, open_input, with_whole_paths
 from .plan import Plan, expected_limit, plan_run
@@ -217,6 +217,7 @@ def _stages(
     check_box(settings.fit.vacuum_box, movie.shape[1:], drift["drift"].to_numpy())
     yield "drift"
     summed = attempt(partial(sum_stage, movie, drift, outputs.sum, workers, send))
+    made.movie = movie = open_movie(movie.path)  # its gain and offset may have been measured
     yield "sum"
     session.finish_aside()  # it imports what comes next: two threads could meet in packages that import each other
 

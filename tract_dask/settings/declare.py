@@ -33,6 +33,7 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    words: tuple[str, ...] = (),
     grouped: bool = False,
     common: bool = False,
     pattern: str = "",
@@ -42,8 +43,8 @@ def setting(
     """Declare a setting: a dataclass field that carries its documentation and its range.
 
     Its option on the command line has its name, after the name of its group where it is ``grouped``; ``--help`` lists
-    the ``common`` ones. A setting that is ``in_files_only`` has no option. Text, or each text of a list, has to match
-    ``pattern``, which ``form`` puts in words.
+    the ``common`` ones. A setting that is ``in_files_only`` has no option. A number (``float | str``) may also be one
+    of the ``words``. Text, or each text of a list, has to match ``pattern``, which ``form`` puts in words.
     """
     return field(
         default=default,
@@ -53,6 +54,7 @@ def setting(
             "low": low,
             "high": high,
             "choices": choices,
+            "words": words,
             "grouped": grouped,
             "common": common,
             "pattern": pattern,
@@ -91,7 +93,8 @@ class Settings:
             if isinstance(value, int) and not isinstance(value, bool) and plain_type(kinds[item.name]) is float:
                 value = float(value) if abs(value) < 2**1000 else math.inf
             object.__setattr__(self, item.name, value)
-            if not isinstance(value, Settings):
+            word = isinstance(value, str) and value in item.metadata.get("words", ())
+            if not isinstance(value, Settings) and not word:
                 _check(type(self), item, kinds[item.name], value)
 
 
@@ -108,6 +111,7 @@ def is_optional(annotation: Any) -> bool:
 
 
 def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: Any) -> None:
+    """Check the value of a setting against its type, words, choices, form and range; raises SettingsError."""
     meta = item.metadata
     where = f"setting {item.name} ({owner.__name__})"
     if value is None and is_optional(annotation):
@@ -117,7 +121,7 @@ def _check(owner: type, item: dataclasses.Field[Any], annotation: Any, value: An
         raise SettingsError(
             "the value is of the wrong type",
             where,
-            "list" if kind is tuple else kind.__name__,
+            " or ".join(("list" if kind is tuple else kind.__name__, *meta.get("words", ()))),
             shown(value),
             meta.get("description", ""),
         )

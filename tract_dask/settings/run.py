@@ -42,8 +42,23 @@ class MetadataSettings(Settings):
         None, "Time from one frame to the next", unit="s", low=1e-12, high=1e6, common=True
     )
     dose: float | None = setting(None, "Electron dose of one frame", unit="e/A^2", low=0, common=True)
-    gain: float = setting(
-        1.0, "Electron counts for one detector unit", unit="counts", low=1e-12, high=1e12, common=True
+    gain: float | str = setting(
+        1.0,
+        "Electron counts for one detector unit; auto: measured from the noise",
+        unit="counts",
+        low=1e-12,
+        high=1e12,
+        words=("auto",),
+        common=True,
+    )
+    offset: float | str = setting(
+        0.0,
+        "Detector units of a pixel without electrons; auto: measured from the noise",
+        unit="detector units",
+        low=-1e12,
+        high=1e12,
+        words=("auto",),
+        common=True,
     )
 
 

@@ -13,16 +13,19 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from ..cluster.stage_run import StageRun
+from ..errors import InputError
 from ..kernels.sums import add_frames, coverage
 from ..progress import Sink, silent
 from ..settings.declare import Settings
-from ..store import schema
+from ..store import metadata, schema
 from ..store.arrays import load_saved, save_array
+from ..store.camera import Camera
 from ..store.journal import Payload
-from ..store.keys import counted, stage_key
+from ..store.keys import Part, counted, stage_key
 from ..store.movie import Movie
 from ..store.shards import Shard, split
 from .keep import Workers, kept
+from .noise import measure_camera
 
 Bools = NDArray[np.bool_]
 
@@ -45,7 +48,8 @@ def sum_image(
     feature at p in the summed image lies at p - rounding_px + drift in a frame. It is within 0.29 / sqrt(frames).
 
     NaN and infinite pixels and frames whose drift has quality 0 are left out. A pixel that no frame covers has image 0
-    and exposure 0.
+    and exposure 0. What some of the frames tell of gain, offset and noise is the attribute ``camera``, which
+    :meth:`tract_dask.store.camera.Camera.of` reads.
 
     Parameters
     ----------
@@ -57,8 +61,8 @@ def sum_image(
     Returns
     -------
     xr.Dataset
-        :data:`schema.SUM`, with attributes ``n_frames``, ``pixel_size_pm``, ``rounding_px``. The same, bit for bit,
-        for any number of workers.
+        :data:`schema.SUM`, with attributes ``n_frames``, ``pixel_size_pm``, ``rounding_px``, ``camera``. The
+        same, bit for bit, for any number of workers.
 
     Raises
     ------
@@ -79,7 +83,10 @@ def sum_image(
             if payloads[part.index]["missing"]:
                 exposure -= load_saved(done.path / f"{part.index}-missing.npy")
         image = np.divide(total * movie.gain, exposure, out=np.zeros(total.shape), where=exposure > 0)
+        image -= movie.gain * movie.offset * (exposure > 0)
         rounding = np.zeros(2) if drift is None else (drift["drift"].to_numpy() - shift)[used].mean(axis=0)
+        mean, shifts = image / movie.gain + movie.offset, schema.drift_of(drift, movie.n_frames)
+        camera = measure_camera(movie, mean, exposure > used.sum() / 2, shifts, used)
         stage.end(f"mean of {int(used.sum())} frames")
     variables = {"image": image, "exposure": exposure.astype(np.uint32)}
     return xr.Dataset(
@@ -88,6 +95,7 @@ def sum_image(
             "n_frames": int(used.sum()),
             "pixel_size_pm": movie.pixel_size_pm,
             "rounding_px": [float(value) for value in rounding],
+            **camera.to_attribute(),
         },
     )
 
@@ -132,11 +140,51 @@ def _sum_part(movie: Movie, shift: NDArray[np.int64], used: Bools, folder: Path,
 def sum_stage(
     movie: Movie, drift: xr.Dataset | None, path: Path, workers: Workers, on_event: Sink = silent
 ) -> xr.Dataset:
-    """Return the drift-corrected sum of ``movie``, kept at ``path``."""
+    """Return the drift-corrected sum of ``movie``, kept at ``path``.
+
+    Gain and offset that are to be measured go into the movie's store, and into the sum: open the movie again.
+
+    Raises
+    ------
+    InputError
+        Where they are to be measured, and cannot be.
+    """
     moved = [] if drift is None else [drift[name].to_numpy() for name in ("drift", "quality")]
-    key = stage_key("sum", movie.key, counted("sum"), movie.gain, *moved)
+    key = stage_key("sum", movie.key, counted("sum"), *_scale(movie), *moved)
 
     def make(journal: Path) -> xr.Dataset:
-        return sum_image(movie, drift, client=workers(), on_event=on_event, journal=journal)
+        summed = sum_image(movie, drift, client=workers(), on_event=on_event, journal=journal)
+        if not movie.to_measure:
+            return summed
+        gain, offset = _measured(movie, summed)
+        image = (summed["image"] / movie.gain + movie.offset - offset) * gain
+        return summed.assign(image=image.where(summed["exposure"] > 0, 0.0).assign_attrs(summed["image"].attrs))
 
-    return kept("sum", movie, path, key, Settings(), make, on_event)
+    summed = kept("sum", movie, path, key, Settings(), make, on_event)
+    gain, offset = _measured(movie, summed)
+    if (gain, offset) != (movie.gain, movie.offset):
+        metadata.update_attributes(movie.path, gain=gain, offset=offset)
+    return summed
+
+
+def _scale(movie: Movie) -> tuple[Part, ...]:
+    """Return what counts of gain and offset in the key of the sum."""
+    if movie.to_measure:
+        return ("measured", *movie.to_measure)
+    return (movie.gain, movie.offset) if movie.offset else (movie.gain,)
+
+
+def _measured(movie: Movie, summed: xr.Dataset) -> tuple[float, float]:
+    """Return the gain and the offset of a movie, from its camera where they are to be measured."""
+    wanted, camera = movie.to_measure, Camera.of(summed.attrs)
+    if wanted and camera.per_electron is None:
+        raise InputError(
+            f"{' and '.join(wanted)} cannot be measured: {camera.reason}",
+            str(movie.path),
+            "vacuum and columns of different brightness in a dozen frames or more",
+            f"{movie.n_frames} frames",
+            f"Give {' and '.join(f'--{name}' for name in wanted)} as numbers",
+        )
+    gain = 1 / camera.per_electron if "gain" in wanted and camera.per_electron else movie.gain
+    level = camera.zero if camera.offset is None else camera.offset
+    return gain, movie.offset if "offset" not in wanted or level is None else level

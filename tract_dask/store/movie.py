@@ -71,11 +71,11 @@ def open_movie(path: str | Path) -> Movie:
         key=present["key"],
         frames_per_shard=present["frames_per_shard"],
         bins=tuple(present["bins"]),
-        **{name: present[name] for name in schema.CALIBRATION},
+        **{name: present[name] for name in schema.CALIBRATION if name in present},
     )
 
 
-_NEEDED = ("shape", "complete", "frames_per_shard", "dtype", "key", "bins", *schema.CALIBRATION)
+_NEEDED = ("shape", "complete", "frames_per_shard", "dtype", "key", "bins", *schema.CALIBRATION[:4])
 
 
 def check_known(path: Path, present: Mapping[str, Any]) -> None:
@@ -114,7 +114,7 @@ class Movie:
         Frames in each shard but the last.
     bins
         Factors of the binned levels, ascending.
-    pixel_size_pm, frame_time_s, dose, gain
+    pixel_size_pm, frame_time_s, dose, gain, offset
         As :class:`tract_dask.readers.SourceMetadata` has them.
     """
 
@@ -128,9 +128,20 @@ class Movie:
     frame_time_s: float | None
     dose: float | None
     gain: float
+    offset: float = 0.0
 
     def __reduce__(self) -> tuple[Callable[..., Movie], tuple[Any, ...]]:
         return open_movie, (self.path,)
+
+    def counts(self, pixels: Frames) -> Frames:
+        """Return pixels as they are read, (..., y, x), in electron counts, float32."""
+        whole = pixels - np.float32(self.offset) if self.offset else pixels
+        return np.asarray(whole * np.float32(self.gain), np.float32)
+
+    @property
+    def summed(self) -> int:
+        """Frames of the camera in a frame of this movie."""
+        return 1
 
     @property
     def n_frames(self) -> int:
@@ -224,6 +235,11 @@ class Movie:
         """Which part of its source the movie is, as :class:`tract_dask.readers.source.Part` says; None: all of it."""
         part: dict[str, int] | None = metadata.attributes(self.path).get("part")
         return part
+
+    @property
+    def to_measure(self) -> tuple[str, ...]:
+        """What of ``gain`` and ``offset`` is to be measured: until the frames are summed they are 1 and 0."""
+        return tuple(metadata.attributes(self.path).get("to_measure", ()))
 
     def times(self) -> NDArray[np.float64]:
         """Return the start of each frame (frames,) in s; the frame's number where the frame time is not known."""

@@ -26,7 +26,7 @@ from .schema import REJECTED, Status
 from .shard_files import CHUNK_KEYS, chunk_path, codecs
 from .source_pixels import with_source_coordinates
 
-_SCALES = schema.CALIBRATION[:-1]
+_SCALES = schema.CALIBRATION[:3]
 """What pixels and frames mean: attributes of the store, which any reader finds there."""
 
 FITTED = ("fit", "stderr", "intensity", "intensity_error", "intensity_stderr")
@@ -258,9 +258,8 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     dataset.attrs |= {name: about.get(name) for name in _SCALES}
     dataset.attrs |= part_attributes(about.get("part"))
     settings = from_toml(FitSettings, about["settings"], str(path))
-    dataset.attrs |= how_fitted(
-        settings, about["window"], about["reference_blur_px"], about.get("threshold_scale", 1.0)
-    )
+    known = (about.get("threshold_scale", 1.0), about.get("dark_variance", 0.0))
+    dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"], *known)
     return with_source_coordinates(dataset)
 
 
@@ -307,13 +306,13 @@ def _nothing_here(path: Path) -> MissingStoreError:
 
 
 def how_fitted(
-    settings: FitSettings, window_px: int, reference_blur_px: float, threshold_scale: float
+    settings: FitSettings, window_px: int, reference_blur_px: float, threshold_scale: float, dark_variance: float = 0.0
 ) -> dict[str, Any]:
     """Return what an analysis needs to know of the fits, as attributes of their Dataset.
 
     They are the window's diameter, sigma of the blur that the windows went through and of that of the summed image
-    (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, the ``intensity_scale``, and what scales the
-    threshold.
+    (``fit_ref``), the ``shape`` (fixed or free), the ``estimator``, the ``intensity_scale``, what scales the threshold,
+    and the ``dark_variance``, that of a pixel without electrons, counts^2.
     """
     return {
         "window_px": window_px,
@@ -323,6 +322,7 @@ def how_fitted(
         "estimator": settings.estimator,
         "intensity_scale": settings.intensity_scale,
         "threshold_scale": float(threshold_scale),
+        "dark_variance": float(dark_variance),
     }
 
 

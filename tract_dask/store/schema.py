@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from ..errors import SettingsError, StoreError
 from ..kernels.gaussian.parameters import PARAMETER_UNITS, PARAMETERS
 
-CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain")
-"""What a movie's numbers mean: size of a pixel, time of a frame, dose of a frame, counts for one detector unit."""
+CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain", "offset")
+"""What a movie's numbers mean: size of a pixel, time and dose of a frame, counts for one detector unit, and the
+detector units of none."""
 
 AXES = ("y", "x")
 """Labels of the ``axis`` dimension of a drift."""

@@ -30,7 +30,12 @@ class Bounds(NamedTuple):
 
 
 def column_bounds(
-    parameters: npt.ArrayLike, side: int, *, radius_px: float = math.inf, fixed_shape: bool = False
+    parameters: npt.ArrayLike,
+    side: int,
+    *,
+    radius_px: float = math.inf,
+    fixed_shape: bool = False,
+    dark_variance: float = 0.0,
 ) -> Bounds:
     """Return the Cramér-Rao bounds for columns in square windows of counts.
 
@@ -44,6 +49,8 @@ def column_bounds(
         Pixels farther than this from the window's middle pixel (side // 2, side // 2) do not count.
     fixed_shape
         Whether sigma_a, sigma_b and theta are known; amplitude, position and background are not, in any case.
+    dark_variance
+        That of a pixel without electrons (read noise), counts^2: its noise is taken for that of so many counts more.
 
     Returns
     -------
@@ -67,6 +74,7 @@ def column_bounds(
     bounds = np.full((3, len(columns)), np.nan)
     for k, column in enumerate(columns):
         expected, slopes, by_volume = model_slopes(column, x, y, fixed_shape=fixed_shape)
+        expected = expected + dark_variance
         if not (expected > 0).all():  # NaN is not
             continue
         scale = np.sqrt((slopes**2 / expected).sum(axis=1))

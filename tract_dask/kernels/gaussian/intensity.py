@@ -13,7 +13,7 @@ INTENSITY_SCALE = {"paper": 0.9545**2, "ellipse": 1 - np.exp(-2)}
 """Share of a Gaussian inside two sigma: the paper's (a box of +-2 sigma) and that of the ellipse of Equation 5."""
 
 
-def intensities(estimates: Floats, scale: str = "paper") -> tuple[Floats, Floats]:
+def intensities(estimates: Floats, scale: str = "paper", dark_variance: float = 0.0) -> tuple[Floats, Floats]:
     """Return column intensities and their errors, in counts.
 
     Parameters
@@ -23,6 +23,8 @@ def intensities(estimates: Floats, scale: str = "paper") -> tuple[Floats, Floats
     scale
         ``paper``: Equation 3's 0.9545^2, the share of the Gaussian in a box of +-2 sigma. ``ellipse``: 1 - exp(-2), the
         share in the ellipse of radii 2 sigma, over which Equation 5 counts the background.
+    dark_variance
+        That of a pixel without electrons (read noise), counts^2; it counts in Equation 5 as background does.
 
     Notes
     -----
@@ -32,5 +34,5 @@ def intensities(estimates: Floats, scale: str = "paper") -> tuple[Floats, Floats
     """
     area = estimates[..., SIGMA_A] * estimates[..., SIGMA_B]
     intensity = INTENSITY_SCALE[scale] * 2 * np.pi * estimates[..., AMPLITUDE] * area
-    variance = intensity + 8 * np.pi * estimates[..., BACKGROUND] * area
+    variance = intensity + 8 * np.pi * (estimates[..., BACKGROUND] + dark_variance) * area
     return intensity, np.sqrt(np.maximum(variance, 0))

@@ -219,9 +219,10 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
         raise SourceError(
             "the movie store is unfinished", str(path), "a finished one", "", "Run the command that writes it again"
         )
-    known = {name: as_number(store.get(name)) for name in ("pixel_size_pm", "frame_time_s", "dose", "gain")}
+    known = {name: as_number(store.get(name)) for name in ("pixel_size_pm", "frame_time_s", "dose", "gain", "offset")}
     gain = _or_none(known["gain"]) or 1.0
-    note = f"{path.name}: the movie was converted with a gain of {gain:g}, which is used"
+    offset = _or_none(known["offset"]) or 0.0
+    note = f"{path.name}: the movie was converted with a gain of {gain:g} and an offset of {offset:g}, which are used"
     return replace(
         said,
         pixel_size_pm=_or_none(known["pixel_size_pm"]),
@@ -229,8 +230,9 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
         dose=_or_none(known["dose"]),
         along_frames={**said.along_frames, **_along(place, above, store)},
         gain=gain,
+        offset=offset,
         part=_part(store.get("part")),
-        notes=said.notes + ((note,) if gain != 1.0 else ()),
+        notes=said.notes + ((note,) if (gain, offset) != (1.0, 0.0) else ()),
     )
 
 

@@ -85,6 +85,7 @@ class SettingRow(BaseModel):
                 "low": 0.001,
                 "high": 10000000.0,
                 "choices": [],
+                "words": [],
             }
         }
     )
@@ -101,6 +102,7 @@ class SettingRow(BaseModel):
     low: float | None
     high: float | None
     choices: list[str]
+    words: list[str] = Field(description="What may stand in place of a number.")
 
 
 class SettingList(BaseModel):

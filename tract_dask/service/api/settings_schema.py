@@ -40,7 +40,7 @@ def setting_rows() -> list[dict[str, Any]]:
             "items": _items(annotation),
             "optional": is_optional(annotation),
             "default": item.default,
-            **{key: item.metadata[key] for key in ("unit", "description", "low", "high", "choices")},
+            **{key: item.metadata[key] for key in ("unit", "description", "low", "high", "choices", "words")},
         }
         for group, item, annotation in declared()
     ]
@@ -61,6 +61,8 @@ def _schema(item: dataclasses.Field[Any], annotation: Any) -> dict[str, Any]:
     meta = item.metadata
     kind = _JSON_TYPES[plain_type(annotation)]
     schema: dict[str, Any] = {"type": [kind, "null"] if is_optional(annotation) else kind}
+    if meta["words"]:
+        schema["type"] = [kind, "string"]
     unit = f" ({meta['unit']})" if meta["unit"] else ""
     schema["description"] = f"{meta['description']}{unit}."
     schema |= {key: meta[name] for key, name in (("minimum", "low"), ("maximum", "high")) if meta[name] is not None}

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from distributed import Client
@@ -109,7 +110,7 @@ def convert(
 
     replaces = overwrite and not is_sound(path)
     if not replaces and is_converted(path, movie, settings, source_settings):
-        update_metadata(path, known, **remembered(movie))
+        update_metadata(path, known, **remembered(movie), to_measure=_to_measure(metadata))
         remove_journal(journal_beside(path))
         on_event(announce(done_frames=n_frames))
         on_event(StageDone(STAGE, time.perf_counter() - started, reused=True, summary="already converted"))
@@ -124,9 +125,20 @@ def convert(
     job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, stamps, movie.permit)
     with hold(Folder.at(path)):
         finalise(path, _write_shards(movie, job, shards, journal, workers, on_event), known)
+        update_metadata(path, known, to_measure=_to_measure(metadata))
     journal.remove()
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
     return path
+
+
+def _to_measure(metadata: MetadataSettings) -> list[str]:
+    """Return what of gain and offset the sum of the frames is to tell."""
+    return [name for name in ("gain", "offset") if isinstance(getattr(metadata, name), str)]
+
+
+def _said(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a movie's attributes say of its calibration."""
+    return {name: about[name] for name in schema.CALIBRATION if name in about}
 
 
 def _write_shards(
@@ -222,7 +234,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     if everything:
         for name in about.get("frame_values", ()):
             datasets.overwrite_array(path / frame_array(name), source.metadata.along_frames[name].values)
-        finalise(path, statistics, SourceMetadata(**{name: about[name] for name in schema.CALIBRATION}))
+        finalise(path, statistics, SourceMetadata(**_said(about)))
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
 
 

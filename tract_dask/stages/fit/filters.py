@@ -40,6 +40,11 @@ def filter_frame(frame: np.ndarray[Any, Any], settings: FitSettings, gain: float
     return blur(counts, settings.blur_sigma_px) if settings.filter == "gaussian" else counts
 
 
+def above_offset(pixels: np.ndarray[Any, Any], offset: float) -> np.ndarray[Any, Any]:
+    """Return pixels less the offset of the camera, in detector units."""
+    return pixels - np.float32(offset) if offset else pixels
+
+
 def _spread(frame: np.ndarray[Any, Any]) -> Frame:
     """Return random numbers from -0.5 to 0.5, (y, x), the same for the same frame; zeros where pixels are fractions."""
     if not np.array_equal(frame, np.rint(frame)):
@@ -79,7 +84,7 @@ def filter_frames(movie: Movie, name: str = "gaussian", **parameters: float) -> 
     pixels = frames.data.rechunk((1, -1, -1))
 
     def filtered(block: np.ndarray[Any, Any]) -> Frame:
-        return filter_frame(block[0], settings, movie.gain)[None]
+        return filter_frame(above_offset(block[0], movie.offset), settings, movie.gain)[None]
 
     found = da.map_blocks(filtered, pixels, dtype=np.float32, meta=np.empty((0, 0, 0), np.float32))
     attributes = {key: value for key, value in frames.attrs.items() if key != "gain"}

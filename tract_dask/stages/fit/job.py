@@ -20,6 +20,7 @@ from ...kernels.presence import Filters, matched_filters
 from ...settings.run import FitSettings
 from ...settings.toml import from_toml
 from ...store import datasets, metadata, results, schema
+from ...store.camera import Camera
 from ...store.columns import positions
 from ...store.journal import left_over
 from ...store.movie import Movie
@@ -50,6 +51,11 @@ class Job:
     refined_by: int | None
     """Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured."""
     settings: FitSettings
+    offset: float = 0.0
+    """Counts that a pixel without electrons has in the movie."""
+    dark_variance: float = 0.0
+    """Variance of a pixel without electrons, counts^2, as far as it is known: that of read noise. Negative where the
+    offset is larger than was said."""
     unit: float = 1.0
     """Counts in the unit that the reference is in."""
     scale: float = 1.0
@@ -76,6 +82,8 @@ class Job:
             vacuum=self.vacuum,
             reference_blur_px=self.reference_blur_px,
             refine_columns=self.refined_by,
+            offset=self.offset,
+            dark_variance=self.dark_variance,
             threshold_scale=self.scale,
             residual_share=self.left_over,
             lost=list(self.lost),
@@ -98,6 +106,8 @@ class Job:
             reference_blur_px=about["reference_blur_px"],
             refined_by=about["refine_columns"],
             settings=from_toml(FitSettings, about["settings"], str(path)),
+            offset=about["offset"],
+            dark_variance=about["dark_variance"],
             scale=about["threshold_scale"],
             left_over=about["residual_share"],
             lost=tuple(about["lost"]),
@@ -107,6 +117,8 @@ class Job:
     def reference(self) -> Floats:
         """(columns, 7) fit on the summed image, as it would be after the blur of the windows, in :attr:`unit`.
 
+        The background has what every pixel of a window has more, so that it is as large as the noise's variance:
+        :attr:`dark_variance`.
         What could not be fitted there holds the median shape at the seed's place.
         """
         reference: Floats = self.columns["fit_ref"].to_numpy().astype(np.float64)
@@ -123,8 +135,19 @@ class Job:
         reference[:, X] = np.where(known, reference[:, X], self.columns["x_ref"].to_numpy())
         reference[:, Y] = np.where(known, reference[:, Y], self.columns["y_ref"].to_numpy())
         reference = blurred(reference, self.settings.window_blur_px**2 - self.reference_blur_px**2)
+        reference[:, BACKGROUND] += self.dark_variance
         reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
         return reference
+
+    @property
+    def noise_key(self) -> list[float]:
+        """What counts of the camera in the key of the fits; nothing where it is as a counting one."""
+        return [self.offset, self.dark_variance] if self.offset or self.dark_variance else []
+
+    @property
+    def floor(self) -> np.float32:
+        """What is subtracted from windows, in :attr:`unit`: what is left is as large as its variance."""
+        return np.float32(0 if self.settings.filters_frames else (self.offset - self.dark_variance) / self.unit)
 
     @cached_property
     def filters(self) -> Filters:
@@ -162,7 +185,8 @@ def prepare(
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
     check_pixels(statistics, str(movie.path))
-    if settings.estimator == "poisson":
+    camera = camera_of(movie, summed)
+    if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0:
         check_counts(statistics["frame_min"].to_numpy())
     measured = drift is not None and drift.attrs.get("method") != "none"
     return Job(
@@ -175,6 +199,8 @@ def prepare(
         refined_by=settings.refine_columns if settings.refine_drift and measured else None,
         settings=settings,
         lost=_lost(drift),
+        offset=movie.gain * movie.offset,
+        dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
     )
 
 
@@ -182,6 +208,19 @@ def _lost(drift: xr.Dataset | None) -> tuple[int, ...]:
     """Return the frames whose drift could not be measured; none where it was for no frame, and is zero."""
     quality = np.ones(1) if drift is None else drift["quality"].to_numpy()
     return tuple(np.flatnonzero((quality == 0) & (quality > 0).any()).tolist())
+
+
+def dark_variance(movie: Movie, camera: Camera) -> float:
+    """Return the variance of a pixel without electrons in counts^2; 0 where none is seen for sure."""
+    if camera.zero is None or camera.zero_stderr is None or abs(movie.offset - camera.zero) < 3 * camera.zero_stderr:
+        return 0.0
+    return movie.gain * (movie.offset - camera.zero)
+
+
+def camera_of(movie: Movie, summed: xr.Dataset | None) -> Camera:
+    """Return what the sum of a movie's frames says of the camera, for the frames of this movie."""
+    found = Camera.of(None if summed is None else summed.attrs)
+    return found.of_sums(movie.summed // found.frames)
 
 
 def check_counts(smallest: Floats) -> None:
@@ -199,7 +238,7 @@ def check_counts(smallest: Floats) -> None:
             "setting estimator (FitSettings)",
             "counts, or a multiple of counts, for poisson",
             f"{smallest[frame]:g} in frame {frame}",
-            "Choose the estimator lsq, or convert frames from which nothing was subtracted",
+            "Choose the estimator lsq, give the offset (--offset), or convert frames from which nothing was subtracted",
         )
 
 

@@ -69,7 +69,7 @@ def fit_columns(
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
     dataset["time"] = ("frame", movie.times(), schema.RESULTS["time"].attributes)
     dataset.attrs = calibration(movie) | results.how_fitted(
-        job.settings, job.window_px, job.reference_blur_px, job.scale
+        job.settings, job.window_px, job.reference_blur_px, job.scale, job.dark_variance
     )
     dataset.attrs |= results.part_attributes(movie.part)
     return with_source_coordinates(dataset)

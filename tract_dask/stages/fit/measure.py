@@ -20,7 +20,7 @@ from ...store.movie import Movie
 from ...store.schema import SIZES, Status
 from ...store.shards import Shard
 from .common_motion import common_motion, masked_median
-from .filters import filter_frame
+from .filters import above_offset, filter_frame
 from .frame_fits import FrameFits
 from .incomplete import cut_raw, fill_near, fit_incomplete
 from .job import Job
@@ -99,6 +99,7 @@ def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[P
             continue
         for number, pixels in enumerate(movie.read(start, stop), start):
             filters = job.settings.filters_frames
+            pixels = above_offset(pixels, movie.offset) if filters else pixels
             frame, lacking = (_filtered(pixels, job.settings, gain), 1.0) if filters else (pixels, gain)
             tiles = Tiles(frame[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
             yield Places.of(movie.shape[1:], number, number + 1, job), tiles, lacking
@@ -121,7 +122,8 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
     status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
     drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
-    intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale)
+    fits.estimates[..., BACKGROUND] -= job.dark_variance
+    intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale, job.dark_variance)
     return {
         "fit": fits.estimates,
         "stderr": fits.stderr,
@@ -199,6 +201,8 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
         part = slice(start, start + batch)
         y, x = places.corner[part, :, 0], places.corner[part, :, 1]
         windows = cut_windows(tiles, y, x, job.window_px, job.settings.window_blur_px, gain, start)
+        if job.floor:
+            windows -= job.floor
         limits = [values[part].reshape(-1, 7) for values in bounds]
         fits = _fit_windows(windows.reshape(-1, *windows.shape[2:]), limits, np.arange(y.size) % n_columns, job)
         sound = ~(places.outside[part] | places.bad[part, None])
@@ -225,7 +229,7 @@ def _fit_again(
     tiles, first, corners, gain = pixels
     halo = gaussian_kernel(job.settings.window_blur_px).size // 2
     frame, column = np.divmod(which, corners.shape[1])
-    raw = cut_raw(tiles, first + frame, corners[frame, column] - halo, job.window_px + 2 * halo, gain)
+    raw = cut_raw(tiles, first + frame, corners[frame, column] - halo, job.window_px + 2 * halo, gain) - job.floor
 
     def fit(windows: NDArray[np.float32], numbers: NDArray[np.int64]) -> FrameFits:
         return _fit_windows(windows, [values[which[numbers]] for values in bounds], column[numbers], job)

@@ -141,7 +141,7 @@ def fit_key(movie: Movie, job: Job) -> str:
     """Return the key of the fit stage: the movie, the gain, and every number that the fit starts from."""
     arrays = (job.reference, job.drift, job.columns["column_id"].to_numpy().astype(np.int64))
     vacuum = None if job.vacuum is None else [int(edge) for edge in job.vacuum]
-    numbers: list[Any] = [movie.gain, int(job.window_px), vacuum, job.refined_by]
+    numbers: list[Any] = [movie.gain, int(job.window_px), vacuum, job.refined_by, *job.noise_key]
     kinds = [str(kind) for kind in job.columns["kind"].to_numpy()]
     numbers += [list(job.lost)] if job.lost else []
     return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)

@@ -11,6 +11,7 @@ import { h, setAttribute, setText } from "./dom.js";
  * @property {string | null} items of an array
  * @property {boolean} optional
  * @property {string[]} choices
+ * @property {string[]} words that may stand in place of a number
  * @property {string} unit
  * @property {number | null} low
  * @property {number | null} high
@@ -48,7 +49,7 @@ const CHOICES = {
 
 /** Names in words, where the declared name with spaces would not do. */
 const TITLES = {
-  "metadata.pixel_size_pm": "Pixel size", "metadata.frame_time_s": "Frame time", "metadata.dose": "Dose of a frame", "metadata.gain": "Gain",
+  "metadata.pixel_size_pm": "Pixel size", "metadata.frame_time_s": "Frame time", "metadata.dose": "Dose of a frame", "metadata.gain": "Gain", "metadata.offset": "Offset",
   "fit.window_px": "Fit window", "fit.blur_sigma_px": "Blur", "fit.shape": "Shape of a column", "drift.method": "Drift", "columns.method": "Find columns", "columns.contrast": "Columns are",
   "columns.csv": "Table of columns", "drift.csv": "Table of drift", "convert.shard_mb": "Shard",
   "source.roi": "Field", "source.bin": "Binning",
@@ -99,7 +100,7 @@ class Setting {
     if (row.type === "boolean") return h("input", { type: "checkbox", id, onchange: changed });
     if (row.items === "object") return h("textarea", { class: "input", id, oninput: changed, spellcheck: "false", placeholder: '[{"origin": [10, 10], "a": [90, 12], "a_count": 9, "b": [8, 70], "b_count": 7}]' });
     const numeric = row.type === "integer" || row.type === "number";
-    return h("input", { class: "input", id, oninput: changed, inputmode: numeric ? "decimal" : null, autocomplete: "off", spellcheck: "false", placeholder: this.placeholder() });
+    return h("input", { class: "input", id, oninput: changed, inputmode: numeric && !row.words.length ? "decimal" : null, autocomplete: "off", spellcheck: "false", placeholder: this.placeholder() });
   }
 
   placeholder() {
@@ -134,7 +135,7 @@ class Setting {
     else if (!row.choices.length) {
       const text = control.value.trim();
       if (!text) return undefined;
-      value = row.items === "object" ? tables(text) : row.type === "array" ? text.split(",").map((part) => number(part, true)) : row.type === "string" ? text : number(text, row.type === "integer");
+      value = row.words.includes(text) ? text : row.items === "object" ? tables(text) : row.type === "array" ? text.split(",").map((part) => number(part, true)) : row.type === "string" ? text : number(text, row.type === "integer");
       if (row.low !== null && value < row.low) throw new Error(`At least ${row.low} ${unitText(row.unit)}`);
       if (row.high !== null && value > row.high) throw new Error(`At most ${row.high} ${unitText(row.unit)}`);
     }

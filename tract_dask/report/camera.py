@@ -1,0 +1,51 @@
+"""What a report says of the camera: what was measured, and where that is not what was said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from ..store.camera import Camera
+
+OFF = 0.1
+"""A gain, or an offset as a share of the usual level above it, that is off by more than this is worth a warning."""
+_SURE = 4.0
+"""Standard errors by which it must be off as well."""
+_READ_SHARE = 0.5
+"""An offset that would leave more than this share of the noise to the read noise is doubted."""
+
+
+def camera_findings(camera: Camera, gain: float, offset: float, level: float) -> Iterator[dict[str, Any]]:
+    """Yield what there is to say of gain and offset: title, text, remedy and whether it is serious.
+
+    Parameters
+    ----------
+    gain, offset
+        As the movie has them: counts for a detector unit, and detector units without electrons.
+    level
+        The usual pixel, detector units.
+    """
+    if camera.per_electron is None or camera.zero is None:
+        text = f"Gain and offset could not be compared with the noise: {camera.reason}."
+        yield {"title": "The camera was not measured", "text": text, "serious": False}
+        return
+    off = abs(gain * camera.per_electron - 1)
+    if off > OFF and off > _SURE * (camera.per_electron_stderr or 0) / camera.per_electron:
+        text = (
+            f"The noise is that of {camera.per_electron:.3g} detector units an electron, a gain of "
+            f"{1 / camera.per_electron:.3g}; {gain:.3g} was said. Equation 5, doses and numbers of electrons are wrong "
+            "by that factor; positions and errors of the fits are not."
+        )
+        remedy = "Run the same command again with --gain auto."
+        yield {"title": "The gain is not what was said", "text": text, "remedy": remedy}
+    above = level - camera.zero
+    below, share = camera.zero - offset, (offset - camera.zero) / above if above > 0 else 0.0
+    known = camera.offset if camera.offset is not None else camera.zero
+    sure = _SURE * (camera.zero_stderr or 0)
+    if above > 0 and ((below > OFF * above and below > sure) or (share > _READ_SHARE and -below > sure)):
+        text = (
+            f"The noise tells of an offset of {known:.4g} detector units, where the usual pixel has {level:.4g}; "
+            f"{offset:.4g} was said. Backgrounds and intensities in units of vacuum are wrong by the difference."
+        )
+        remedy = "Run the same command again with --offset auto, or with the number that the camera's maker gives."
+        yield {"title": "The offset is not what was said", "text": text, "remedy": remedy}
