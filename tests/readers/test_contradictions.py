@@ -146,3 +146,22 @@ def test_references_beside_sequences(write: Callable[[Path], object], words: str
     known = open_source(tmp_path / "m.seq").metadata
     assert [note for note in known.notes if "m.dark.mrc" in note and words in note], known.notes
     assert ("dark" in known.references) == (words == "it is not applied")
+
+
+@pytest.mark.parametrize(
+    ("attributes", "odd"),
+    [
+        ({"pixel_size": 0.1, "pixel_unit": "nm"}, ["pixel_size"]),
+        ({"frame_rate": 25.0, "pixel_size_nm": 0.1}, ["frame_rate"]),
+        ({"exposure_s": 0.1, "frame_time_s": 0.2, "pixelsize": 1}, ["pixelsize"]),
+        ({"title": "a", "voltage": 300}, []),
+    ],
+)
+def test_attributes_that_may_be_a_calibration_are_named(
+    attributes: dict[str, Any], odd: list[str], tmp_path: Path
+) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["movie"] = FRAMES
+        file["movie"].attrs.update(attributes)
+    said = [f"a.h5: its attribute {name} cannot be understood; it is not used" for name in odd]
+    assert open_source(tmp_path / "a.h5").metadata.notes == tuple(said)

@@ -251,3 +251,31 @@ def test_a_folder_with_brackets_is_that_folder(tmp_path: Path) -> None:
     folder(tmp_path / "day[1]", ["f_0.npy", "f_1.npy"])
     assert order(f"{tmp_path}/day[1]/f_*.npy") == [0, 1]
     assert list_files("x", tmp_path / "day[1]", READERS) is not None
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["img_30-11-2026.tif", "img_01-12-2026.tif"], "dates such as 01-12-2026, with the year last"),
+        (["img_2026-11-30.tif", "img_2026-12-01.tif"], ""),
+        (["f_1.tif", "f_01.tif", "f_2.tif"], "f_01.tif and f_1.tif have the same numbers"),
+    ],
+)
+def test_names_whose_order_is_in_doubt(names: list[str], words: str, tmp_path: Path) -> None:
+    for name in names:
+        tifffile.imwrite(tmp_path / name, np.zeros((4, 5), "u2"))
+    notes = open_source(tmp_path).metadata.notes
+    assert bool(notes) == bool(words)
+    assert all(words in note for note in notes)
+
+
+def test_files_that_hold_other_numbers_of_frames_and_links(tmp_path: Path) -> None:
+    for k, length in enumerate((2, 2, 1)):
+        np.save(tmp_path / f"f_{k}.npy", np.zeros((length, 4, 5)))
+    assert open_source(tmp_path).metadata.notes == ()
+    np.save(tmp_path / "f_3.npy", np.zeros((2, 4, 5)))
+    (tmp_path / "f_4.npy").symlink_to("f_1.npy")
+    assert open_source(tmp_path).metadata.notes == (
+        "the files hold different numbers of frames: f_0.npy 2, f_2.npy 1",
+        "f_4.npy is a link to f_1.npy; both are read as frames",
+    )

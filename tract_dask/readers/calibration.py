@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -72,6 +73,16 @@ DECLARED = ("pixel_size_", "frame_time_")
 """Beginnings of attributes that programs give to arrays, with the unit behind."""
 
 
+_LENGTH = re.compile(r"(pixel|voxel)_?(size|spacing|width|scale)", re.IGNORECASE)
+_TIME = re.compile(r"frame_?(rate|time|interval|period)|fps|exposure", re.IGNORECASE)
+"""Names of attributes that may be meant for a calibration."""
+
+
+def may_calibrate(name: str) -> bool:
+    """Tell whether an attribute of this name says something of pixel size or frame time, understood or not."""
+    return _LENGTH.match(name) is not None or _TIME.match(name) is not None
+
+
 def declared(attributes: Mapping[str, Any]) -> tuple[float | None, float | None]:
     """Return pixel size (pm) and frame time (s) by attributes such as ``pixel_size_nm`` and ``frame_time_ms``.
 
@@ -103,13 +114,15 @@ def with_declared(said: SourceMetadata, holders: Iterable[Mapping[str, Any]], wh
         The array, for notes.
     """
     pixel = seconds = None
-    notes = []
+    notes, odd = [], list[str]()
     for attributes in holders:
         found = declared(attributes)
         pixel, seconds = found[0] or pixel, found[1] or seconds
-        for name, value in attributes.items():
-            if name.startswith(DECLARED) and declared({name: value}) == (None, None):
-                notes.append(f"{where}: its attribute {name} cannot be understood; it is not used")
+        odd += [name for name, value in attributes.items() if declared({name: value}) == (None, None)]
+    for name in odd:
+        known = (said.pixel_size_pm or pixel) if _LENGTH.match(name) else (said.frame_time_s or seconds)
+        if name.startswith(DECLARED) or not known:
+            notes.append(f"{where}: its attribute {name} cannot be understood; it is not used")
     for what, unit, known, given in (
         ("pixel size", "pm", said.pixel_size_pm, pixel),
         ("frame time", "s", said.frame_time_s, seconds),

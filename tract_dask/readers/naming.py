@@ -62,6 +62,8 @@ def notes_on(names: Sequence[str]) -> tuple[str, ...]:
     return (
         _decimals(names, rule)
         + _powers(names)
+        + _dates(names)
+        + _twice(plain, rule)
         + _copied(copies)
         + _several(kinds)
         + _series(largest, rule)
@@ -175,6 +177,29 @@ def _powers(names: Sequence[str]) -> tuple[str, ...]:
         f"the names hold numbers such as {found}, which are not taken for powers of ten: check the order of the frames,"
         " or give the files as a list",
     )
+
+
+_DATE = re.compile(r"(?<!\d)(\d{1,2})[-._](\d{1,2})[-._](?:19|20)\d\d(?!\d)")
+
+
+def _dates(names: Sequence[str]) -> tuple[str, ...]:
+    """Return a note where names hold dates that differ, with the year last: they are not ordered by them."""
+    found = {match[0] for name in names if (match := _DATE.search(_stem(name)))}
+    if len(found) < 2:
+        return ()
+    return (
+        f"the names hold dates such as {min(found)}, with the year last, by which they are not ordered: check the order"
+        " of the frames, or give the files as a list",
+    )
+
+
+def _twice(names: Sequence[str], rule: re.Pattern[str]) -> tuple[str, ...]:
+    """Return a note where two names in their order differ in the spelling of numbers only, such as 1 and 01."""
+    same = [pair for pair in pairwise(names) if _parts(pair[0], rule) == _parts(pair[1], rule)]
+    if not same:
+        return ()
+    more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
+    return (f"{same[0][0]} and {same[0][1]} have the same numbers{more}; both are read as frames",)
 
 
 def _copies(names: Sequence[str]) -> dict[str, str]:

@@ -105,6 +105,7 @@ def open_sequence(
     firsts = np.cumsum([0, *lengths])
     names = [file.name for file in files]
     notes = (gaps if listed else notes_on)(names) + _left_out(references or {})
+    notes += _unlike(lengths, names) + _repeated(files)
     metadata = _joined(known, lengths, names)
     return SequenceSource(
         path=path,
@@ -120,6 +121,25 @@ def open_sequence(
         inside=first.inside,
         open_file=open_file,
     )
+
+
+def _unlike(lengths: Sequence[int], names: Sequence[str]) -> tuple[str, ...]:
+    """Return a note where files hold different numbers of frames; the last one may have fewer."""
+    odd = next((k for k, n in enumerate(lengths) if n != lengths[0] and (k < len(lengths) - 1 or n > lengths[0])), None)
+    if odd is None:
+        return ()
+    return (f"the files hold different numbers of frames: {names[0]} {lengths[0]}, {names[odd]} {lengths[odd]}",)
+
+
+def _repeated(files: Sequence[Path]) -> tuple[str, ...]:
+    """Return a note where a file is a link to another one of the sequence."""
+    links = [file for file in files if file.is_symlink()]
+    others = {str(file.resolve()): file.name for file in files if file not in links} if links else {}
+    found = [(link.name, others[there]) for link in links if (there := str(link.resolve())) in others]
+    if not found:
+        return ()
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return (f"{found[0][0]} is a link to {found[0][1]}{more}; both are read as frames",)
 
 
 def _left_out(references: Mapping[str, Path]) -> tuple[str, ...]:

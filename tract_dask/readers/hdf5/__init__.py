@@ -14,7 +14,7 @@ from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..axes import Axis, Order, ordered, spelled_out
 from ..blocks import fill_from
-from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
+from ..calibration import as_number, calibrated, may_calibrate, packing, with_declared
 from ..checks import DAMAGE, MOST_FRAMES, Frames, Permit, checked_dtype, checked_file, open_binary, reading, widened
 from ..joined import JoinedSource, check_alike
 from ..source import Source, SourceMetadata
@@ -280,7 +280,7 @@ def _metadata(file: Any, dataset: Any, axes: list[Axis], order: Order, where: st
     """Return the calibration of the axes or of Velox, or of attributes such as pixel_size_nm and frame_time_ms."""
     said = velox_metadata(dataset, where) if is_velox(dataset) else calibrated(axes, order, where)
     holders = dict.fromkeys((file["/"], dataset.file["/"], dataset.parent, dataset))
-    attributes = [{name: single(item, name) for name in item.attrs if name.startswith(DECLARED)} for item in holders]
+    attributes = [{name: single(item, name) for name in item.attrs if may_calibrate(name)} for item in holders]
     said = with_declared(said, attributes, Path(where.partition("::")[0]).name)
     scaled = packing(as_number(single(dataset, "scale_factor")), as_number(single(dataset, "add_offset")), where)
     return replace(said, notes=said.notes + scaled)

@@ -77,7 +77,9 @@ def open_tia(path: Path, inner: str, settings: SourceSettings, permit: Permit | 
         format="TIA series",
         shape=(n_frames, n_y, n_x),
         dtype=dtype,
-        metadata=replace(known, notes=known.notes + unaccounted(path.name, rest, frame_bytes, FILLING)),
+        metadata=replace(
+            known, notes=known.notes + unaccounted(path.name, rest, frame_bytes, min(frame_bytes, FILLING))
+        ),
         offsets=offsets + _ELEMENT.itemsize,
         stored=stored,
     )

@@ -179,7 +179,7 @@ def _beside(n_reduced: int, tags: Tags, path: Path, stored_bytes: int, frame_byt
         notes = (f"{path.name}: {n_reduced} of its pages are small copies (thumbnails) and are not read",)
     if SUB_PAGES in tags:
         return (*notes, f"{path.name}: its pages have further pages below them (SubIFDs), which are not read")
-    return notes + unaccounted(path.name, path.stat().st_size - stored_bytes, frame_bytes, FILLING)
+    return notes + unaccounted(path.name, path.stat().st_size - stored_bytes, frame_bytes, min(frame_bytes, FILLING))
 
 
 def _turned(tags: Tags, path: Path) -> tuple[str, ...]:

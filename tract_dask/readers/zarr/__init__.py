@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..axes import Order, ordered, spelled_out
-from ..calibration import DECLARED, as_number, calibrated, packing, with_declared
+from ..calibration import as_number, calibrated, may_calibrate, packing, with_declared
 from ..checks import Frames, Permit, checked_claim, checked_dtype, checked_file, reading, truncated, widened
 from ..hdf5.candidates import ambiguous, movies_of, others_of
 from ..source import FrameValues, Part, Source, SourceMetadata
@@ -208,7 +208,7 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
     """
     above = node_at(place, node.name.rpartition("/")[0]) if node.name else None
     holders = [{} if one is None else one.attributes for one in (above, node)]
-    attributes = [{name: value for name, value in one.items() if name.startswith(DECLARED)} for one in holders]
+    attributes = [{name: value for name, value in one.items() if may_calibrate(name)} for one in holders]
     said = with_declared(said, attributes, path.name)
     factor, offset = (as_number(node.attributes.get(name, math.nan)) for name in ("scale_factor", "add_offset"))
     said = replace(said, notes=said.notes + packing(factor, offset, path.name))
