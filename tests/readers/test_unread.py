@@ -26,7 +26,7 @@ FILLED = (".tif", ".stk", ".eer", ".ser")
 """Formats in which parts lie anywhere, with filling between them."""
 
 
-@pytest.mark.parametrize(("suffix", "n_bytes"), [*((one, 7) for one in ANY_BYTE), *((one, 5000) for one in FILLED)])
+@pytest.mark.parametrize(("suffix", "n_bytes"), [*((one, 7) for one in ANY_BYTE), *((one, 9000) for one in FILLED)])
 def test_bytes_at_the_end(suffix: str, n_bytes: int, tmp_path: Path) -> None:
     path = write(tmp_path / f"movie{suffix}")
     assert notes_of(path) == []

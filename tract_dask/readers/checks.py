@@ -285,7 +285,7 @@ def unaccounted(where: str, n_bytes: int, frame_bytes: int, least: int = 1) -> t
     return (f"{where} holds {bytes_}{frames} that its header does not account for; they are not read",)
 
 
-FILLING = 4096
+FILLING = 8192
 """In formats whose parts lie anywhere in a file, so many bytes between them may be filling."""
 
 
