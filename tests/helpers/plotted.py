@@ -48,6 +48,7 @@ def make_tracks(n_frames: int = N_FRAMES) -> xr.Dataset:
         "noise": np.ones((n_frames, n)),
         "time": 0.1 * np.arange(n_frames),
         "r_squared": np.full((n_frames, n), 0.9),
+        "p_value": np.full((n_frames, n), 0.5, np.float32),
     }
     tracks = columns.assign_coords(schema.coordinates(n_frames)).assign(
         {name: (schema.RESULTS[name].dims, value, schema.RESULTS[name].attributes) for name, value in values.items()}

@@ -74,6 +74,7 @@ class Run:
         self.values["intensity"][:] = 4000 + rng.normal(0, 50, (N_FRAMES, n))
         self.values["intensity_stderr"][:] = 50
         self.values["r_squared"][:] = 0.8
+        self.values["p_value"][:] = 0.5
         self.values["drift"][:] = self.values["drift_measured"][:] = self.scene.drift
         self.values["time"][:] = 0.1 * np.arange(N_FRAMES)
         self.folder, self.columns = folder, columns
@@ -237,6 +238,14 @@ def _odd_column(run):
     run.columns["fit_ref"][1, 0] *= 0.5
 
 
+def _two_in_one(run):
+    run.values["p_value"][::4, 1] = 1e-6
+
+
+def _noise_of_another_kind(run):
+    run.values["p_value"][::4] = 1e-6
+
+
 def _lost_frames(run):
     run.values["status"][[4, 5]] = Status.LOST_FRAME
     run.quality = np.where(np.isin(np.arange(N_FRAMES), [4, 5]), 0.0, 0.8)
@@ -278,6 +287,8 @@ def _columns_too_near(run):
         (_long_drift, {"long_drift"}),
         (_drift_step, {"long_step"}),
         (_odd_column, {"residual"}),
+        (_two_in_one, {"one_gaussian"}),
+        (_noise_of_another_kind, set()),
     ],
 )
 def test_warnings_are_where_they_belong(run, change, expected):

@@ -22,9 +22,12 @@ QUANTITIES = ("x", "y", "intensity")
 SERIES = (*QUANTITIES, *(f"{name}_stderr" for name in QUANTITIES))
 FRAME = ("fits", "accepted", "bad", "amplitude", "drift_y", "drift_x")
 _FLAGS = ("below_noise", "not_converged", "at_bound", "shape_at_bound")
-COUNTS = ("fits", "accepted", "outside", *_FLAGS)
+COUNTS = ("fits", "accepted", "outside", *_FLAGS, "unlike")
+UNLIKELY = 1e-3
+"""A fit is unlike one Gaussian where its p-value is below this."""
+
 MEANS = ("x", "y", "intensity", "r_squared", "variance")
-_READ = ("fit", "stderr", "intensity", "intensity_stderr", "r_squared", "status", "drift")
+_READ = ("fit", "stderr", "intensity", "intensity_stderr", "r_squared", "status", "drift", "p_value")
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class ColumnSums:
     ----------
     counts
         (:data:`COUNTS`, column): fits that were made, accepted ones, frames in which the window leaves the image, and
-        made fits with each flag.
+        made fits with each flag, and accepted ones that are unlike one Gaussian.
     moments
         (3, :data:`MEANS`, column): how many accepted fits have a value, its mean, and the sum of squares about the
         mean. x and y in px; ``variance`` is the stated one of the place, per axis.
@@ -138,6 +141,7 @@ class Part:
         fit, stderr, self._status = found["fit"], found["stderr"], found["status"]
         self._fitted, self._accepted = ((self._status & int(flags)) == 0 for flags in (NOT_SEEN, REJECTED))
         self._r_squared, self._amplitude, self._drift = found["r_squared"], fit[..., AMPLITUDE], found["drift"]
+        self._unlike = self._accepted & (found["p_value"] < UNLIKELY)
         own, errors = (fit, "intensity"), (stderr, "intensity_stderr")
         self.series: Floats = np.stack(
             [one for of, name in (own, errors) for one in (of[..., X], of[..., Y], found[name])]
@@ -147,7 +151,7 @@ class Part:
     def columns(self) -> ColumnSums:
         """Return the sums over these frames."""
         flagged = [self._fitted & self._has(Status[name.upper()]) for name in _FLAGS]
-        counts = [self._fitted, self._accepted, self._has(Status.OUTSIDE_FRAME), *flagged]
+        counts = [self._fitted, self._accepted, self._has(Status.OUTSIDE_FRAME), *flagged, self._unlike]
         variance = (self.series[3] ** 2 + self.series[4] ** 2) / 2
         r_squared = np.where(self._accepted, self._r_squared, np.nan)
         values = np.stack([*self.series[:3], r_squared, variance])

@@ -33,6 +33,9 @@ POOR_QUALITY = 0.5
 """A frame that correlates with the sum by less than this share of the usual is named."""
 RESIDUAL = 0.15
 """Residual of a fit on the summed image, as a share of the amplitude, that is worth a look."""
+UNLIKE, UNLIKE_OTHERS = 0.1, 5.0
+"""A column is not one Gaussian where a larger share of its fits is unlike one, and larger by this factor than usual:
+noise that is not as the fit takes it is so in all columns."""
 RIVAL = 0.5
 """Share of the support for one contrast that the other one may have."""
 DOUBTFUL, MANY_DOUBTFUL = 0.2, 0.5
@@ -202,6 +205,16 @@ def _columns(run: Survey) -> Iterator[Finding]:
         )
         remedy = "See the residuals below; a smaller window (--window-px) keeps neighbours out."
         yield Finding("residual", "Some columns do not look like Gaussians", text, remedy)
+    accepted = np.maximum(columns["accepted"].to_numpy(), 1)
+    share = columns["unlike"].to_numpy() / accepted
+    unlike = (share > UNLIKE) & (share > UNLIKE_OTHERS * np.median(share)) & ~poor
+    if unlike.any():
+        text = (
+            f"More than {UNLIKE:.0%} of the fits leave far more than the noise for {_of_columns(ids[unlike])}: "
+            "a second column is close by, or what is there is not a Gaussian."
+        )
+        remedy = "Look at them in the summed image; add the column that is missing to columns.csv and run again."
+        yield Finding("one_gaussian", "One Gaussian is not enough here", text, remedy)
 
 
 def _of_columns(ids: NDArray[np.int64]) -> str:
