@@ -506,6 +506,7 @@ def test_a_process_ends_with_its_standard_input(whole, client):
         "output": str(whole.root.parent / "cut_short"),
         "root": str(whole.root.parent),
         "closed": [],
+        "content": "",
         "mark": {"owner": "ana", "job": "3f9a0c12de", "output": "cut_short"},
         "settings": SETTINGS,
         "cluster": {"scheduler": client.scheduler.address},
