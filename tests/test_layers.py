@@ -73,6 +73,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
     "kernels": {
         "vectors": [],
         "windows": ["vectors"],
+        "filling": {"windows"},
         "gaussian": ["vectors", "windows"],
         "centroids": ["vectors"],
         "presence": ["vectors", "windows", "gaussian"],
@@ -82,6 +83,8 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "magnitude": [],
         "wiener": ["magnitude"],
         "binning": [],
+        "borders": set(),
+        "defects": set(),
         "greys": [],
         "changepoints": [],
         "hops": [],

@@ -18,7 +18,7 @@ from tract_dask.stages.fit.stage import fit_movie
 from tract_dask.store import schema
 from tract_dask.store.results import open_results
 
-LAYOUT = ConvertSettings(tile_px=32)
+LAYOUT = ConvertSettings(tile_px=32, find_defects=False)
 KNOWN = MetadataSettings(pixel_size_pm=8.0, frame_time_s=0.5, dose=125.0)
 
 

@@ -55,6 +55,12 @@ class MemoryMovie:
     def frame_bytes(self):
         return self.pixels[0].nbytes
 
+    def statistics(self):
+        flat = self.pixels.reshape(self.n_frames, -1).astype(float)
+        missing = ~np.isfinite(flat)
+        spread = [row[there].std() if there.any() else np.nan for row, there in zip(flat, ~missing, strict=True)]
+        return xr.Dataset({"frame_std": ("t", spread), "frame_bad_pixels": ("t", missing.sum(axis=1))})
+
     @property
     def shards(self):
         return split(self.n_frames, self.frames_per_shard)

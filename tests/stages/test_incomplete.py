@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from tract_dask import convert, fit_columns, open_movie
+from tract_dask.kernels.filling import fill_near
 from tract_dask.kernels.windows import Tiles, cut_windows
 from tract_dask.settings import ConvertSettings, FitSettings
-from tract_dask.stages.fit.incomplete import cut_raw, fill_near
+from tract_dask.stages.fit.incomplete import cut_raw
 from tract_dask.store.schema import REJECTED, Status
 
 WAYS = {

@@ -79,6 +79,9 @@ class ConvertSettings(Settings):
     )
     tile_px: int = setting(256, "Side of the tiles inside a shard", unit="px", low=16, high=8192)
     codec: str = setting("lz4", "Lossless compression: lz4 is fast, zstd is smaller", choices=("lz4", "zstd", "none"))
+    find_defects: bool = setting(
+        True, "Find hot and dead pixels, spikes, dead lines and borders, and leave them out", common=True
+    )
 
 
 @dataclass(frozen=True)

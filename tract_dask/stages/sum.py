@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..cluster.stage_run import StageRun
 from ..errors import InputError
+from ..kernels.filling import fill_near
 from ..kernels.sums import add_frames, coverage
 from ..progress import Sink, silent
 from ..settings.declare import Settings
@@ -47,9 +49,9 @@ def sum_image(
     a little (0.29 px standard deviation) and moves it by its own mean, the attribute ``rounding_px`` (y, x): a
     feature at p in the summed image lies at p - rounding_px + drift in a frame. It is within 0.29 / sqrt(frames).
 
-    NaN and infinite pixels and frames whose drift has quality 0 are left out. A pixel that no frame covers has image 0
-    and exposure 0. What some of the frames tell of gain, offset and noise is the attribute ``camera``, which
-    :meth:`tract_dask.store.camera.Camera.of` reads.
+    Pixels without data, bad frames and frames whose drift has quality 0 are left out. A pixel that no frame covers has
+    exposure 0, and image 0; where it is one that carries no data, the mean of what is near. What some of the frames
+    tell of gain, offset and noise is the attribute ``camera``, which :meth:`tract_dask.store.camera.Camera.of` reads.
 
     Parameters
     ----------
@@ -77,13 +79,16 @@ def sum_image(
         stage.begin([(done, parts)])
         payloads = stage.run(partial(_sum_part, movie, shift, used, done.path), parts, done)
         exposure = coverage(movie.shape[1:], shift[used])
-        total = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max))
+        total, missing = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max)), False
         for part in parts:
             add_frames(total, load_saved(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
+            missing |= bool(payloads[part.index]["missing"])
             if payloads[part.index]["missing"]:
                 exposure -= load_saved(done.path / f"{part.index}-missing.npy")
         image = np.divide(total * movie.gain, exposure, out=np.zeros(total.shape), where=exposure > 0)
         image -= movie.gain * movie.offset * (exposure > 0)
+        if missing and not exposure.all() and exposure.any():
+            image = fill_near(np.where(exposure > 0, image, np.nan)).astype(np.float64)
         rounding = np.zeros(2) if drift is None else (drift["drift"].to_numpy() - shift)[used].mean(axis=0)
         mean, shifts = image / movie.gain + movie.offset, schema.drift_of(drift, movie.n_frames)
         camera = measure_camera(movie, mean, exposure > used.sum() / 2, shifts, used)
@@ -103,7 +108,9 @@ def sum_image(
 def _whole_pixels(movie: Movie, drift: xr.Dataset | None) -> tuple[NDArray[np.int64], Bools]:
     """Return the drift of every frame in whole pixels, and which frames are to be summed."""
     shift = np.rint(schema.drift_of(drift, movie.n_frames)).astype(np.int64)
-    used = np.ones(movie.n_frames, np.bool_) if drift is None else drift["quality"].to_numpy() > 0.0
+    used = ~schema.bad_frames(movie.statistics(), math.prod(movie.shape[1:]))
+    if drift is not None:
+        used &= drift["quality"].to_numpy() > 0.0
     return shift, used | (not used.any())
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..settings.declare import Settings
 
-ALGORITHMS = {"convert": 1, "drift": 2, "sum": 2, "columns": 2, "fit": 2}
+ALGORITHMS = {"convert": 2, "drift": 2, "sum": 2, "columns": 2, "fit": 2}
 """The number of each stage's algorithm, which is in its keys. Raise it where the stage's results, or a default, change.
 
 A version of the package that leaves them as they are makes nothing anew. ``tests/store/test_algorithms.py`` holds
@@ -64,6 +64,7 @@ KEYED: dict[str, tuple[Keyed, ...]] = {
         Keyed("convert.shard_mb", 256.0),
         Keyed("convert.tile_px", 256),
         Keyed("convert.codec", "lz4"),
+        Keyed("convert.find_defects", True),
     ),
     "drift": (Keyed("drift.method", "auto"), Keyed("drift.search_px", None)),
     "sum": (),

@@ -21,6 +21,7 @@ from . import datasets, metadata, schema
 from .damage import reading
 from .journal import entries, journal_beside
 from .ome import AXES, CHANGING, frame_array
+from .pixels import Pixels, nodes_of, pixels_of, real_of
 from .shard_files import Grid, ShardReader, chunk_path, overlaps
 from .shards import Shard, Shards, split
 
@@ -64,10 +65,11 @@ def open_movie(path: str | Path) -> Movie:
             str(path),
             remedy=f"Run convert on {present['source']} again: it goes on from there",
         )
+    dtype = np.dtype(present["dtype"])
     return Movie(
         path=path,
         shape=shape,
-        dtype=np.dtype(present["dtype"]),
+        dtype=real_of(dtype) if nodes_of(present) else dtype,
         key=present["key"],
         frames_per_shard=present["frames_per_shard"],
         bins=tuple(present["bins"]),
@@ -107,7 +109,7 @@ class Movie:
     shape
         Frames, rows and columns.
     dtype
-        Pixel type.
+        Pixel type of what is read: that of the file, or real numbers where pixels carry no data, which are NaN.
     key
         Key of what it was made from.
     frames_per_shard
@@ -168,7 +170,16 @@ class Movie:
 
         Only the tiles that the part touches are read.
         """
-        return self._part("0", start, stop, y, x)
+        part = self._part("0", start, stop, y, x)
+        if not (pixels := self.pixels):
+            return part
+        first, top, left = (span.indices(n)[0] for span, n in zip((slice(start, stop), y, x), self.shape, strict=True))
+        return pixels.applied(part, first, top, left)
+
+    @property
+    def pixels(self) -> Pixels:
+        """Which pixels carry no data: they are read as NaN."""
+        return pixels_of(self.path, self.key)
 
     def read_tiles(self, start: int, stop: int, boxes: NDArray[np.int64]) -> Tiles:
         """Return the tiles of frames ``start`` to ``stop`` (not included) that boxes touch, as they are decoded.
@@ -188,11 +199,16 @@ class Movie:
         wanted = np.argwhere(place >= 0).tolist()
         number, first = divmod(start, self.frames_per_shard)
         layers = range(first // depth, -(-(stop - number * self.frames_per_shard) // depth))
-        pixels = _reused((len(wanted), len(layers) * depth, height, width), self.dtype)
+        pixels = _reused((len(wanted), len(layers) * depth, height, width), level.dtype)
         with self._shard("0", number) as reader:
             for k, layer in enumerate(layers):
                 for tile, (row, column) in zip(pixels, wanted, strict=True):
                     reader.read_tile(layer, row, column, tile[k * depth : (k + 1) * depth])
+        if left_out := self.pixels:
+            shown = np.empty(pixels.shape, self.dtype)
+            for target, tile, (row, column) in zip(shown, pixels, wanted, strict=True):
+                target[...] = left_out.applied(tile, start, row * height, column * width)
+            pixels = shown
         return Tiles(pixels, place, self.shape[1:])
 
     def tiles(self, shard: Shard) -> Iterator[tuple[int, int, int, Frames]]:
@@ -203,13 +219,14 @@ class Movie:
         level = _open_level(self.path, self.key, "0")
         depth, height, width = level.grid.chunk
         _, rows, columns = level.grid.tiles
-        tile = np.empty(level.grid.chunk, level.dtype)
+        tile, left_out = np.empty(level.grid.chunk, level.dtype), self.pixels
         with self._shard("0", shard.index) as reader:
             for layer, row, column in np.ndindex(-(-shard.frames // depth), rows, columns):
                 reader.read_tile(layer, row, column, tile)
                 start, top, left = layer * depth, row * height, column * width
                 pixels = tile[: shard.frames - start, : self.shape[1] - top, : self.shape[2] - left]
-                yield shard.start + start, top, left, pixels
+                first = shard.start + start
+                yield first, top, left, left_out.applied(pixels, first, top, left) if left_out else pixels
 
     def read_binned(self, factor: int, start: int, stop: int) -> NDArray[np.float32]:
         """Return frames ``start`` to ``stop`` (not included) of a binned level: means (frames, y, x).

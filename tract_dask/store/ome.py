@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..settings.run import is_step_of
 from . import datasets, metadata, schema
 from .damage import METADATA, read_json
+from .pixels import nodes_of
 
 AXES = ("t", "y", "x")
 
@@ -42,9 +43,9 @@ def write_metadata(path: Path, ours: dict[str, Any]) -> None:
         "ome": _ome_metadata(path.name, tuple(ours["bins"]), pixel, frame_time),
         metadata.ATTRIBUTE: ours,
     }
-    nodes = _nodes(path, ours.get("frame_values", ()))
+    nodes = _nodes(path, (*map(frame_array, ours.get("frame_values", ())), *nodes_of(ours)))
     root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": nodes}
-    metadata.write_root(path, root, changed=AXES)
+    metadata.write_root(path, root, changed=(*AXES, *nodes_of(ours)))
 
 
 def frame_array(name: str) -> str:
@@ -71,7 +72,7 @@ def _nodes(path: Path, more: Iterable[str]) -> dict[str, Any]:
     names = (
         *AXES,
         *schema.STATISTICS,
-        *map(frame_array, more),
+        *more,
         "0",
         "binned",
         *(f"binned/{file.name}" for file in (path / "binned").glob("[0-9]*")),

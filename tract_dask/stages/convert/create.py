@@ -16,6 +16,7 @@ from ...store import datasets, disk, files, schema
 from ...store.layout import LEVEL_DTYPE, Layout
 from ...store.metadata import attributes, update_attributes
 from ...store.ome import AXES, CHANGING, frame_array, write_metadata
+from ...store.pixels import GROUP, NO_PIXELS, Pixels, nodes_of
 from ...store.shard_files import CHUNK_KEYS, Grid, codecs
 
 
@@ -100,13 +101,17 @@ def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: d
     )
 
 
-def finalise(path: Path, statistics: dict[str, NDArray[np.float64]], known: SourceMetadata) -> None:
-    """Write the statistics (frames,) and the metadata, and say that the store is complete."""
+def finalise(
+    path: Path, statistics: dict[str, NDArray[np.float64]], known: SourceMetadata, pixels: Pixels = NO_PIXELS
+) -> None:
+    """Write the statistics (frames,), the pixels without data and the metadata, and say that the store is complete."""
     with files.disk_errors(path):
         for name, values in statistics.items():
             datasets.overwrite_array(path / name, values)
-        disk.sync_folders(path, tuple(statistics))
-        write_metadata(path, attributes(path) | quantities(known) | {"complete": True})
+        present = attributes(path)
+        left_out = pixels.write(path, present["shape"][1:])
+        disk.sync_folders(path, (*statistics, *nodes_of({GROUP: left_out})))
+        write_metadata(path, present | quantities(known) | {GROUP: left_out, "complete": True})
 
 
 def quantities(metadata: SourceMetadata | MetadataSettings) -> dict[str, Any]:

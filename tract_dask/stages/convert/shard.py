@@ -24,9 +24,11 @@ from ...settings.run import SourceSettings
 from ...store import files, schema
 from ...store.journal import Payload
 from ...store.layout import LEVEL_DTYPE, Layout
+from ...store.pixels import Pixels
 from ...store.shard_files import ShardWriter, chunk_path
 from ...store.shards import Shard
 from ...store.stamps import Stamps
+from .defects import found_in, in_payload
 
 _AHEAD_BYTES = 32 << 20
 
@@ -43,6 +45,8 @@ class Job:
     codec: str
     stamps: Stamps
     permit: Permit | None = None
+    finder: Path | None = None
+    """Folder of what finds pixels without data; None: they are not looked for."""
 
 
 @lru_cache(maxsize=4)
@@ -59,7 +63,11 @@ def check_files(job: Job, source: FrameSource, shard: Shard) -> None:
 
 
 def convert_shard(job: Job, shard: Shard) -> Payload:
-    """Read the frames of a shard, measure and bin them, write them; return their statistics."""
+    """Read the frames of a shard, measure and bin them, write them; return their statistics.
+
+    Pixels without data are written as they were recorded; statistics and binned means leave them out. Beside the
+    statistics are the spikes of frames, ``spikes`` (n, 3) frame, y, x, and their ``borders``, by frame.
+    """
     source = _opened(job.source, job.source_settings, job.permit, job.stamps.digest)
     check = partial(check_files, job, source, shard)
     check()
@@ -72,18 +80,35 @@ def convert_shard(job: Job, shard: Shard) -> Payload:
             found,
             "Do not change the file meanwhile; convert it again",
         )
-    meter = FrameMeter(job.layout.shape[1:], job.layout.dtype, len(job.layout.bins))
+    meters = _Meters(job.layout)
+    finder = found_in(job.finder) if job.finder else None
     statistics: dict[str, list[float]] = {name: [] for name in schema.STATISTICS}
+    left_out: dict[int, Pixels] = {}
     with files.disk_errors(job.path), ExitStack() as stack:
         writers = [stack.enter_context(_writer(job, factor, shard.index)) for factor in (1, *job.layout.bins)]
-        for frame in _read_ahead(source, shard, job.layout.chunk[0]):
-            *measures, levels = meter.measure(frame)
+        for number, frame in enumerate(_read_ahead(source, shard, job.layout.chunk[0]), shard.start):
+            shown = frame
+            if finder and (odd := finder.look(frame)):
+                shown, left_out[number] = odd.applied(frame[None], 0)[0], odd
+            *measures, levels = meters[shown.dtype].measure(shown)
             for writer, pixels in zip(writers, (frame, *levels), strict=True):
                 writer.add(pixels)
             for values, measure in zip(statistics.values(), measures, strict=True):
                 values.append(measure)
         check()  # before the shards take their places
-    return statistics
+    return statistics | in_payload(left_out)
+
+
+class _Meters(dict[np.dtype[Any], FrameMeter]):
+    """The meters of frames, by their pixel type: some frames of a movie may miss pixels."""
+
+    def __init__(self, layout: Layout) -> None:
+        super().__init__()
+        self._layout = layout
+
+    def __missing__(self, dtype: np.dtype[Any]) -> FrameMeter:
+        self[dtype] = FrameMeter(self._layout.shape[1:], dtype, len(self._layout.bins))
+        return self[dtype]
 
 
 def _read_ahead(source: FrameSource, shard: Shard, depth: int) -> Iterator[NDArray[Any]]:

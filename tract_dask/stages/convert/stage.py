@@ -35,12 +35,14 @@ from ...store.layout import Layout, disk_bytes, plan_layout
 from ...store.metadata import FORMAT, attributes, check_destination, check_nodes, format_of, is_of_system, is_sound
 from ...store.movie import Movie, open_movie
 from ...store.ome import AXES, frame_array
+from ...store.pixels import Pixels, in_words
 from ...store.provenance import WHOLE_BYTES, provenance
 from ...store.shards import Shard, split
 from ...store.stamps import Stamps, changed
 from ..keep import Workers
 from ..pixel_range import check_pixels
 from .create import create, finalise, update_metadata
+from .defects import Gathered, finder_for
 from .origin import (
     AS_THE_FILE_SAYS,
     DECLARED_NOTHING,
@@ -122,12 +124,15 @@ def convert(
     journal = _begun(path, movie, known, layout, settings, source_settings, on_event)
     on_event(announce(done_frames=journal.frames_done(shards)))
     stamps = origin_of(movie).stamps
-    job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, stamps, movie.permit)
+    finder = _finder(movie, settings, journal.path)
+    job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, stamps, movie.permit, finder)
     with hold(Folder.at(path)):
-        finalise(path, _write_shards(movie, job, shards, journal, workers, on_event), known)
+        statistics, pixels = _write_shards(movie, job, shards, journal, workers, on_event)
+        finalise(path, statistics, known, pixels)
         update_metadata(path, known, to_measure=_to_measure(metadata))
     journal.remove()
-    on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{n_frames} frames in {len(shards)} shards"))
+    summary = ", ".join([f"{n_frames} frames in {len(shards)} shards", *in_words(pixels.counts((n_y, n_x)))])
+    on_event(StageDone(STAGE, time.perf_counter() - started, summary=summary))
     return path
 
 
@@ -143,11 +148,13 @@ def _said(about: Mapping[str, Any]) -> dict[str, Any]:
 
 def _write_shards(
     movie: FrameSource, job: Job, shards: Sequence[Shard], journal: Journal, workers: Client | None, on_event: Sink
-) -> dict[str, NDArray[np.float64]]:
-    """Write the shards that the journal does not know; return the statistics (frames,) of all frames by name."""
+) -> tuple[dict[str, NDArray[np.float64]], Pixels]:
+    """Write the shards that the journal does not know; return the statistics (frames,) of all, and what is left out."""
     statistics = {name: np.empty(movie.shape[0]) for name in schema.STATISTICS}
+    gathered = Gathered(movie.shape[0], movie.shape[1:])
 
     def keep(shard: Shard, payload: Payload) -> None:
+        gathered.add(payload)
         for name, values in statistics.items():
             values[shard.start : shard.stop] = payload[name]
 
@@ -163,7 +170,16 @@ def _write_shards(
             file=movie.path,
             on_event=on_event,
         )
-    return statistics
+    return statistics, gathered.pixels(job.finder)
+
+
+def _finder(source: FrameSource, settings: ConvertSettings, folder: Path) -> Path | None:
+    """Look for pixels without data in a sample of the movie; return the folder of what was found."""
+    if not settings.find_defects:
+        return None
+    with disk_errors(folder):
+        finder_for(source, folder)
+    return folder
 
 
 def _begun(
@@ -226,15 +242,19 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     with disk_errors(path), ExitStack() as stack:
         stack.callback(remove, aside)
         aside.mkdir()
-        job = Job(_place(source), declared, path, aside, layout, settings.codec, origin_of(source).stamps)
+        stamps, finder = origin_of(source).stamps, _finder(source, settings, aside)
+        job = Job(_place(source), declared, path, aside, layout, settings.codec, stamps, finder=finder)
+        gathered = Gathered(source.shape[0], source.shape[1:])
         for shard in chosen:
-            for name, values in convert_shard(job, shard).items():
-                statistics[name][shard.start : shard.stop] = values
+            payload = convert_shard(job, shard)
+            gathered.add(payload)
+            for name, values in statistics.items():
+                values[shard.start : shard.stop] = payload[name]
             on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
         for name in about.get("frame_values", ()):
             datasets.overwrite_array(path / frame_array(name), source.metadata.along_frames[name].values)
-        finalise(path, statistics, SourceMetadata(**_said(about)))
+        finalise(path, statistics, SourceMetadata(**_said(about)), gathered.pixels(finder))
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
 
 

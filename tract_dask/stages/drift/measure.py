@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ...cluster.stage_run import StageRun
 from ...kernels.alignment import Template, align
+from ...kernels.filling import fill_near
 from ...kernels.magnitude import unit_of
 from ...kernels.registration import (
     Floats,
@@ -251,7 +252,7 @@ def _in_units(image: Image, unit: float) -> Image:
 def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
     """Yield the frames of a shard on a stored level, a few read at a time; None for one that holds nothing.
 
-    NaN and infinite pixels are replaced by the frame's mean.
+    Pixels without data are filled with the mean of what is near.
     """
     ny, nx = movie.shape[1] // stored, movie.shape[2] // stored
     step = max(1, _BLOCK_BYTES // (ny * nx * (movie.dtype.itemsize if stored == 1 else 4)))
@@ -259,7 +260,8 @@ def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
         stop = min(start + step, shard.stop)
         block = movie.read(start, stop) if stored == 1 else movie.read_binned(stored, start, stop)
         for raw in block[:, :ny, :nx]:  # without bins that hang over the edge
-            image, shows_anything = clean_image(raw)
+            odd = raw.dtype.kind == "f" and not np.isfinite(raw).all()
+            image, shows_anything = clean_image(fill_near(raw) if odd else raw)
             yield image if shows_anything else None
 
 

@@ -8,15 +8,15 @@ the errors are those of the filled window times what is lost with the pixels (:f
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...kernels.filling import fill_near
 from ...kernels.gaussian.missing import widening
 from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, X, Y
-from ...kernels.windows import Tiles, blur, cut_windows, gaussian_kernel
+from ...kernels.windows import Tiles, cut_windows, gaussian_kernel
 from ...settings.run import FitSettings
 from .frame_fits import FrameFits
 
@@ -28,8 +28,6 @@ LARGEST_GROWTH = 3.0
 
 _RESTS_PX = 2e-3
 _MOST_ROUNDS = 40
-_REACH_PX = 3.0
-"""Sigma of the mean of what is near, that a pixel is first filled with."""
 
 
 def cut_raw(
@@ -49,25 +47,6 @@ def cut_raw(
     pixels = tiles.pixels[tiles.place[y // height, x // width], frame[:, None, None], y % height, x % width]
     counts: NDArray[np.float32] = np.multiply(pixels, np.float32(gain), dtype=np.float32)
     return counts
-
-
-def fill_near(image: NDArray[Any]) -> NDArray[np.float32]:
-    """Return an image (y, x) whose pixels that are NaN or infinite are the mean of what is near them.
-
-    Examples
-    --------
-    >>> fill_near(np.array([[2.0, np.nan, 2.0]])).tolist()
-    [[2.0, 2.0, 2.0]]
-    """
-    there = np.isfinite(image)
-    filled: NDArray[np.float32] = np.where(there, image, 0).astype(np.float32)
-    if there.all() or not there.any():
-        return filled
-    level = np.float32(filled[there].mean(dtype=np.float64))
-    share = blur(there.astype(np.float32), _REACH_PX)
-    near = blur(np.where(there, filled - level, 0).astype(np.float32), _REACH_PX)
-    np.copyto(filled, level + near / np.maximum(share, np.float32(1e-3)), where=~there)
-    return filled
 
 
 def fit_incomplete(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.centroids import BEST_RADIUS, SMALLEST_RADIUS_PX, window_centroids
+from ...kernels.filling import fill_near
 from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.intensity import INTENSITY_SCALE, Floats, intensities
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
@@ -22,7 +23,7 @@ from ...store.shards import Shard
 from .common_motion import common_motion, masked_median
 from .filters import above_offset, filter_frame
 from .frame_fits import FrameFits
-from .incomplete import cut_raw, fill_near, fit_incomplete
+from .incomplete import cut_raw, fit_incomplete
 from .job import Job
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 from .noise_size import frame_noise, p_values
@@ -167,7 +168,7 @@ def _noise(
         with np.errstate(divide="ignore", invalid="ignore"):
             empty = _empty_strengths(squares, places.start, job) * (white / vacuum.noise[:, None])
     with np.errstate(divide="ignore", invalid="ignore"):  # frames without noise
-        return noise, white / known, empty.astype(np.float32)
+        return noise, np.where(known > 0, white / known, np.nan), empty.astype(np.float32)
 
 
 def status_of(fits: FrameFits, places: Places, weakest: Floats) -> NDArray[np.uint8]:
@@ -206,7 +207,8 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
         limits = [values[part].reshape(-1, 7) for values in bounds]
         fits = _fit_windows(windows.reshape(-1, *windows.shape[2:]), limits, np.arange(y.size) % n_columns, job)
         sound = ~(places.outside[part] | places.bad[part, None])
-        if (missing := ~np.isfinite(fits.strength) & sound.ravel()).any():
+        real = tiles.pixels.dtype.kind == "f"
+        if real and (missing := ~np.isfinite(windows.sum(axis=(2, 3)).ravel()) & sound.ravel()).any():
             _fit_again(fits, np.flatnonzero(missing), (tiles, start, places.corner[part], gain), limits, job)
         parts.append(fits)
     return FrameFits.joined(parts, places.outside.shape)

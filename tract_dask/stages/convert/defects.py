@@ -1,0 +1,121 @@
+"""Pixels without data, found while a movie is converted: those of all frames in a sample, the others frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...kernels.borders import shown_part
+from ...kernels.defects import History, Moments, Noise, find_spikes, look_back
+from ...readers.source import FrameSource
+from ...store.arrays import DamagedArrayError, load_saved, save_array
+from ...store.pixels import Pixels
+
+_SAMPLE_FRAMES = 32
+_FEWEST_FRAMES = 6
+"""With fewer a hot pixel cannot be told from a spike."""
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds what carries no data in a frame.
+
+    Attributes
+    ----------
+    history
+        What the sample of the movie told; None where it told nothing.
+    """
+
+    history: History | None
+
+    def look(self, frame: NDArray[Any]) -> Pixels:
+        """Return what is left out of a frame (y, x), as the first one of a movie."""
+        if self.history is None:
+            return Pixels(borders=_border(frame))
+        spikes = find_spikes(frame, self.history)
+        placed = np.column_stack([np.zeros(len(spikes), np.int32), spikes]).astype(np.int32)
+        mask = self.history.mask if self.history.mask.any() else None
+        return Pixels(mask, placed if len(placed) else None, _border(frame))
+
+
+def _border(frame: NDArray[Any]) -> NDArray[np.int32] | None:
+    shown = shown_part(frame)
+    return None if shown is None else np.array([shown], np.int32)
+
+
+def finder_for(source: FrameSource, folder: Path) -> None:
+    """Look at a sample of a movie, and leave what it tells in ``folder``, for the tasks; once."""
+    try:
+        _load(folder)
+    except DamagedArrayError:
+        history = _history(source)
+        shape = source.shape[1:] if history else (0, 0)
+        save_array(folder / "mask.npy", history.mask if history else np.zeros(shape, np.uint8))
+        save_array(folder / "usual.npy", history.usual if history else np.zeros(shape, np.float32))
+        save_array(folder / "noise.npy", np.array(history.noise if history else (0.0, 0.0)))
+
+
+@lru_cache(maxsize=2)
+def found_in(folder: Path) -> Finder:
+    """Return the finder that :func:`finder_for` has left."""
+    return _load(folder)
+
+
+def _load(folder: Path) -> Finder:
+    mask, usual, noise = (load_saved(folder / f"{name}.npy") for name in ("mask", "usual", "noise"))
+    return Finder(History(mask, usual, Noise(*map(float, noise))) if mask.size else None)
+
+
+def _history(source: FrameSource) -> History | None:
+    """Return what pairs of frames, spread over the movie, tell of its pixels."""
+    n_frames = source.shape[0]
+    if n_frames < _FEWEST_FRAMES:
+        return None
+    moments, pairs = Moments(source.shape[1:]), _SAMPLE_FRAMES // 2
+    whole = n_frames <= _SAMPLE_FRAMES
+    starts = range(n_frames) if whole else [k * (n_frames - 2) // (pairs - 1) for k in range(pairs)]
+    for number, start in enumerate(starts):
+        frames = source.read(start, start + (1 if whole else 2))
+        for k, frame in enumerate(frames):
+            moments.add(frame, follows=k > 0 or (whole and number > 0))
+    with np.errstate(invalid="ignore", over="ignore"):  # pixels that hold no number
+        return look_back(moments)
+
+
+def in_payload(found: dict[int, Pixels]) -> dict[str, Any]:
+    """Return the spikes and borders of frames, by their numbers, as what a task leaves in its journal."""
+    spikes = [
+        [number, int(y), int(x)] for number, one in found.items() if one.spikes is not None for _, y, x in one.spikes
+    ]
+    borders = {str(number): one.borders[0].tolist() for number, one in found.items() if one.borders is not None}
+    return ({"spikes": spikes} if spikes else {}) | ({"borders": borders} if borders else {})
+
+
+class Gathered:
+    """What the tasks of a conversion have found."""
+
+    def __init__(self, n_frames: int, shape: tuple[int, int]) -> None:
+        self._whole, self._n_frames = np.array([0, shape[0], 0, shape[1]], np.int32), n_frames
+        self._spikes: list[list[int]] = []
+        self._borders: dict[str, list[int]] = {}
+
+    def add(self, payload: dict[str, Any]) -> None:
+        """Add what a task left."""
+        self._spikes += payload.get("spikes", [])
+        self._borders |= payload.get("borders", {})
+
+    def pixels(self, finder: Path | None) -> Pixels:
+        """Return what is left out of the movie, with the mask that is in the finder's folder."""
+        history = found_in(finder).history if finder else None
+        mask = history.mask if history and history.mask.any() else None
+        spikes = np.array(sorted(self._spikes), np.int32) if self._spikes else None
+        if not self._borders:
+            return Pixels(mask, spikes)
+        borders = np.tile(self._whole, (self._n_frames, 1))
+        borders[[int(number) for number in self._borders]] = list(self._borders.values())
+        return Pixels(mask, spikes, borders)
