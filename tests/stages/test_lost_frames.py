@@ -9,7 +9,7 @@ import tract_dask as td
 from tract_dask.stages.drift.measure import lost_frames
 from tract_dask.store.schema import REJECTED, Status
 
-N, LOST = 36, [5, *range(16, 24), 35]
+N, LOST = 36, [0, 5, *range(16, 24), 35]
 BUDGET_PX = 0.3
 """Of the drift of the other frames: a follower that is led astray comes back a period, 30 px, off."""
 

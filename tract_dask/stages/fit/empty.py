@@ -73,6 +73,7 @@ def _noise_alone(job: Job) -> tuple[Job, NDArray[np.float32], float]:
         columns=column_dataset(places, fit=shape),
         drift=np.zeros((1, 2)),
         bad=np.zeros(1, np.bool_),
+        lost=(),
         vacuum=None,
         reference_blur_px=job.settings.window_blur_px,
         refined_by=None,
