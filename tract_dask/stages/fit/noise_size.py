@@ -81,9 +81,8 @@ def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowN
     nearest = np.abs(np.log(width[:, None] / width[chosen])).argmin(axis=1)
     degrees = _degrees(some[len(some) // 2], size, settings)
     counts = np.array([evaluate(column, *_places(size)).mean() for column in some])[nearest]
-    level = (
-        np.maximum(counts, 0) if settings.counting or settings.estimator == "poisson" else np.full_like(counts, np.inf)
-    )
+    counted = (settings.counting or settings.estimator == "poisson") & (counts > 0)
+    level = np.where(counted, counts, np.inf)
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
     grain = (kernel @ kernel) ** 4 / (2 * (np.convolve(kernel, kernel) ** 2).sum() ** 2)
     if settings.estimator == "poisson":
@@ -198,7 +197,7 @@ def _exact(column: Floats, size: int, settings: FitSettings) -> tuple[Floats, fl
     reach = kernel.size // 2
     along = np.arange(-reach, size + reach)
     raw = evaluate(blurred(column, -(settings.window_blur_px**2)), along, along[:, None])
-    variance = np.maximum(raw, 0) if settings.counting else np.ones_like(raw)
+    variance = np.maximum(raw, 0) if settings.counting and (raw > 0).any() else np.ones_like(raw)
     wide = spread @ images @ spread.T
     meat = np.einsum("iyx,jyx,yx->ij", wide, wide, variance)
     whole = float((power @ disc.astype(float) @ power.T * variance).sum())
