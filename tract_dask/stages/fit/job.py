@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ...errors import SettingsError
+from ...kernels.gaussian.correlated import error_factors
 from ...kernels.gaussian.intensity import Floats
 from ...kernels.gaussian.model import blurred
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
@@ -56,6 +57,8 @@ class Job:
     dark_variance: float = 0.0
     """Variance of a pixel without electrons, counts^2, as far as it is known: that of read noise. Negative where the
     offset is larger than was said."""
+    correlation: tuple[tuple[float, ...], ...] | None = None
+    """Autocorrelation of the pixels' noise; None where pixels share none, or it is not known."""
     unit: float = 1.0
     """Counts in the unit that the reference is in."""
     scale: float = 1.0
@@ -84,6 +87,7 @@ class Job:
             refine_columns=self.refined_by,
             offset=self.offset,
             dark_variance=self.dark_variance,
+            correlation=self.correlation,
             threshold_scale=self.scale,
             residual_share=self.left_over,
             lost=list(self.lost),
@@ -108,6 +112,7 @@ class Job:
             settings=from_toml(FitSettings, about["settings"], str(path)),
             offset=about["offset"],
             dark_variance=about["dark_variance"],
+            correlation=tuple(map(tuple, about["correlation"])) if about["correlation"] else None,
             scale=about["threshold_scale"],
             left_over=about["residual_share"],
             lost=tuple(about["lost"]),
@@ -142,12 +147,28 @@ class Job:
     @property
     def noise_key(self) -> list[float]:
         """What counts of the camera in the key of the fits; nothing where it is as a counting one."""
-        return [self.offset, self.dark_variance] if self.offset or self.dark_variance else []
+        level = [self.offset, self.dark_variance] if self.offset or self.dark_variance else []
+        return level + [value for row in self.correlation or () for value in row]
 
     @property
     def floor(self) -> np.float32:
         """What is subtracted from windows, in :attr:`unit`: what is left is as large as its variance."""
         return np.float32(0 if self.settings.filters_frames else (self.offset - self.dark_variance) / self.unit)
+
+    @cached_property
+    def error_factors(self) -> Floats | None:
+        """(columns, 8) by what noise that pixels share changes stated errors; None where pixels share none."""
+        if self.correlation is None:
+            return None
+        return error_factors(
+            self.reference,
+            self.window_px,
+            np.array(self.correlation),
+            blur_sigma_px=self.settings.window_blur_px,
+            fixed_shape=self.settings.shape == "fixed",
+            counting=self.settings.counting,
+            likelihood=self.settings.estimator == "poisson",
+        )
 
     @cached_property
     def filters(self) -> Filters:
@@ -201,6 +222,7 @@ def prepare(
         lost=_lost(drift),
         offset=movie.gain * movie.offset,
         dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
+        correlation=camera.correlation if camera.shared.size > 1 else None,
     )
 
 

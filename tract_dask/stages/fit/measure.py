@@ -268,6 +268,9 @@ def _fit_windows(
     if settings.shape == "free":  # a sigma on its bound moves amplitude and background by more than they scatter
         fits.stderr[fits.at_bound, AMPLITUDE] = fits.stderr[fits.at_bound, BACKGROUND] = np.nan
         fits.volume_stderr[fits.at_bound] = np.nan
+    if job.error_factors is not None:
+        fits.stderr[:] *= job.error_factors[which, :7]
+        fits.volume_stderr[:] *= job.error_factors[which, 7]
     held, residual = np.zeros(len(windows), np.bool_), np.full(len(windows), np.nan)
     for k in (AMPLITUDE, X, Y, BACKGROUND):
         low, high, value = lower[:, k], upper[:, k], fits.estimates[:, k]

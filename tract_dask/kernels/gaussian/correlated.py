@@ -1,0 +1,108 @@
+"""Errors of fits where pixels share their noise: what they are, in units of those that white noise would give.
+
+With the slopes J of the model, H = J^T J and noise of covariance C, the estimates have the covariance
+H^-1 (J^T C J) H^-1, and the residual's sum of squares the expectation tr C - tr(H^-1 J^T C J), from which the size of C
+is taken. Both are evaluated twice: for white noise, and for noise with the autocorrelation that was measured, both
+after the blur; for maximum likelihood with every pixel in units of its own standard deviation.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..windows import gaussian_kernel
+from .information import model_slopes
+from .parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+
+Floats = NDArray[np.float64]
+
+_ALIKE = 0.05
+"""Columns whose shape and contrast differ by less than this share have the same factors."""
+
+
+def error_factors(
+    parameters: Floats,
+    size: int,
+    correlation: Floats,
+    *,
+    blur_sigma_px: float = 0.0,
+    fixed_shape: bool = True,
+    counting: bool = True,
+    likelihood: bool = False,
+) -> Floats:
+    """Return by what the stated errors of columns are to be multiplied, (n, 8): Equation 1's seven, and the volume.
+
+    Parameters
+    ----------
+    parameters
+        (n, 7) of Equation 1 in the windows, after their blur, the background as large as its noise's variance.
+    size
+        Diameter of the windows, px.
+    correlation
+        (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; 1 in the middle.
+    """
+    shape = np.abs(parameters[:, [SIGMA_A, SIGMA_B, AMPLITUDE, BACKGROUND]])
+    shape[:, 2] /= np.maximum(shape[:, 3], 1e-9 * np.maximum(shape[:, 2], 1e-300))
+    alike = np.rint(np.log(np.maximum(shape[:, :3], 1e-6)) / _ALIKE)
+    _, first, which = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+    kernel = gaussian_kernel(blur_sigma_px).astype(np.float64)
+    found = [
+        _factors(parameters[k], size, correlation, kernel, (fixed_shape, counting or likelihood, likelihood))
+        for k in first
+    ]
+    return np.array(found).reshape(-1, 8)[which.ravel()]
+
+
+def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how: tuple[bool, bool, bool]) -> Floats:
+    fixed_shape, counting, likelihood = how
+    margin = kernel.size // 2
+    side = size + 2 * margin
+    at = column.copy()
+    at[[X, Y]] = side // 2
+    rows, across = np.indices((side, side), dtype=np.float64)
+    expected, slopes, volume = model_slopes(at, across.ravel(), rows.ravel(), fixed_shape=fixed_shape)
+    variance = np.maximum(expected, 0.02 * np.abs(expected).max()) if counting else np.ones(expected.size)
+    disc = (np.hypot(rows - side // 2, across - side // 2) <= size / 2).ravel()
+    slopes = np.where(disc, slopes, 0.0)
+    scale = np.sqrt((slopes**2).sum(axis=1))
+    slopes, volume = slopes / scale[:, None], np.asarray(volume) / scale
+    if likelihood:
+        slopes = slopes / np.sqrt(variance)
+    hessian = np.linalg.pinv(slopes @ slopes.T)
+    reach = len(correlation) // 2
+    padded = (2 * side, 2 * side)
+    images = slopes.reshape(-1, side, side)
+    if not likelihood:
+        blur = np.fft.rfft2(np.outer(kernel, kernel), padded)
+        spread = np.fft.irfft2(np.fft.rfft2(images, padded) * blur, padded)
+        images = spread[:, margin : margin + side, margin : margin + side] * np.sqrt(variance).reshape(side, side)
+    own = np.fft.rfft2(images, padded)
+    lags = np.zeros(padded)
+    lag = np.arange(-reach, reach + 1)
+    lags[np.ix_(lag % padded[0], lag % padded[1])] = correlation
+    blurred = np.correlate(kernel, kernel, "full")
+    blurred = np.pad(blurred, max(0, reach - (kernel.size - 1)))
+    middle = len(blurred) // 2
+    kept = blurred[middle - reach : middle + reach + 1]
+    total = float(variance[disc].sum())
+    traces = (
+        (float(disc.sum()),) * 2
+        if likelihood
+        else (total * float(blurred[middle]) ** 2, total * float((correlation * np.outer(kept, kept)).sum()))
+    )
+    errors = []
+    white = np.ones((padded[0], padded[1] // 2 + 1))
+    for spectrum, trace in zip((white, np.fft.rfft2(lags).real), traces, strict=True):
+        shared = np.fft.irfft2(own * spectrum, padded)[:, :side, :side].reshape(len(images), -1)
+        meat = images.reshape(len(images), -1) @ shared.T
+        covariance = hessian @ meat @ hessian
+        left = trace - float(np.trace(hessian @ meat))
+        variances = np.append(covariance.diagonal(), volume @ covariance @ volume)
+        errors.append(variances / left if left > 0 else np.full(variances.size, np.nan))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x, y, amplitude, background, *shapes, of_volume = np.sqrt(errors[1] / errors[0])
+    widths = max(shapes, default=math.nan)
+    return np.array([amplitude, x, y, *(widths if shapes else 1.0,) * 3, background, of_volume])
