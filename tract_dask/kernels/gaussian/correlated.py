@@ -83,16 +83,7 @@ def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how
     lags = np.zeros(padded)
     lag = np.arange(-reach, reach + 1)
     lags[np.ix_(lag % padded[0], lag % padded[1])] = correlation
-    blurred = np.correlate(kernel, kernel, "full")
-    blurred = np.pad(blurred, max(0, reach - (kernel.size - 1)))
-    middle = len(blurred) // 2
-    kept = blurred[middle - reach : middle + reach + 1]
-    total = float(variance[disc].sum())
-    traces = (
-        (float(disc.sum()),) * 2
-        if likelihood
-        else (total * float(blurred[middle]) ** 2, total * float((correlation * np.outer(kept, kept)).sum()))
-    )
+    traces = _traces(variance[disc], correlation, kernel, likelihood=likelihood)
     errors = []
     white = np.ones((padded[0], padded[1] // 2 + 1))
     for spectrum, trace in zip((white, np.fft.rfft2(lags).real), traces, strict=True):
@@ -106,3 +97,16 @@ def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how
         x, y, amplitude, background, *shapes, of_volume = np.sqrt(errors[1] / errors[0])
     widths = max(shapes, default=math.nan)
     return np.array([amplitude, x, y, *(widths if shapes else 1.0,) * 3, background, of_volume])
+
+
+def _traces(variance: Floats, correlation: Floats, kernel: Floats, *, likelihood: bool) -> tuple[float, float]:
+    """Return the sum of the variances of the pixels that are fitted, for white noise and for what is shared."""
+    if likelihood:
+        return float(variance.size), float(variance.size)
+    reach = len(correlation) // 2
+    blurred = np.correlate(kernel, kernel, "full")
+    blurred = np.pad(blurred, max(0, reach - (kernel.size - 1)))
+    middle = len(blurred) // 2
+    kept = blurred[middle - reach : middle + reach + 1]
+    total = float(variance.sum())
+    return total * float(blurred[middle]) ** 2, total * float((correlation * np.outer(kept, kept)).sum())

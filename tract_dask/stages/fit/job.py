@@ -156,10 +156,10 @@ class Job:
         return np.float32(0 if self.settings.filters_frames else (self.offset - self.dark_variance) / self.unit)
 
     @cached_property
-    def error_factors(self) -> Floats | None:
-        """(columns, 8) by what noise that pixels share changes stated errors; None where pixels share none."""
+    def error_factors(self) -> Floats:
+        """(columns, 8) by what noise that pixels share changes stated errors: 1 where they share none."""
         if self.correlation is None:
-            return None
+            return np.ones((len(self.reference), 8))
         return error_factors(
             self.reference,
             self.window_px,

@@ -263,14 +263,12 @@ def _fit_windows(
         counting=settings.counting,
         own_noise=False,
     )
-    fits.stderr[:] *= np.nan if settings.filters_frames else job.window_noise.errors[which]
-    fits.volume_stderr[:] *= np.nan if settings.filters_frames else job.window_noise.volume[which]
+    shared = job.error_factors[which]
+    fits.stderr[:] *= np.nan if settings.filters_frames else job.window_noise.errors[which] * shared[:, :7]
+    fits.volume_stderr[:] *= np.nan if settings.filters_frames else job.window_noise.volume[which] * shared[:, 7]
     if settings.shape == "free":  # a sigma on its bound moves amplitude and background by more than they scatter
         fits.stderr[fits.at_bound, AMPLITUDE] = fits.stderr[fits.at_bound, BACKGROUND] = np.nan
         fits.volume_stderr[fits.at_bound] = np.nan
-    if job.error_factors is not None:
-        fits.stderr[:] *= job.error_factors[which, :7]
-        fits.volume_stderr[:] *= job.error_factors[which, 7]
     held, residual = np.zeros(len(windows), np.bool_), np.full(len(windows), np.nan)
     for k in (AMPLITUDE, X, Y, BACKGROUND):
         low, high, value = lower[:, k], upper[:, k], fits.estimates[:, k]
