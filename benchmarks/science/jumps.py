@@ -14,9 +14,8 @@ from tract_dask.analysis import motion
 from tract_dask.analysis.intensity import vacuum_level
 from tract_dask.analysis.jumps import change_points, threshold_jumps
 from tract_dask.analysis.occupancy import count_atoms
-from tract_dask.analysis.presence import present, states
+from tract_dask.analysis.presence import looked, present, states
 from tract_dask.store.results import accepted
-from tract_dask.store.schema import Status
 
 from .scenes import moving_columns, open_scene, table_of
 from .tables import Table, with_error
@@ -59,7 +58,7 @@ def run(data: Path, work: Path) -> list[Table]:
             vacuum_level(scene.summed, columns=scene.columns),
             max_atoms=_MAX_ATOMS,
         )
-        seen = (tracks["status"] & np.uint8(Status.OUTSIDE_FRAME)) == 0
+        seen = looked(tracks)
         tests = {
             "fit not accepted": accepted(tracks)["intensity"].isnull(),
             "`threshold=3`": accepted(tracks, 3.0)["intensity"].isnull(),

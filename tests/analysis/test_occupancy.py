@@ -8,10 +8,11 @@ import xarray as xr
 from scipy import stats
 
 from tract_dask import accepted, convert, fit_columns, open_movie
+from tract_dask.analysis.intensity import normalised
 from tract_dask.analysis.likelihood import CONFIDENCE, Levels, credible_sets, probabilities
 from tract_dask.analysis.lookup import intensity_bound, look_up_table, read_table, write_table
 from tract_dask.analysis.mixtures import mixture
-from tract_dask.analysis.occupancy import count_atoms, dose_to_be_sure
+from tract_dask.analysis.occupancy import _sigma, count_atoms, dose_to_be_sure
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.gaussian import parameters
 from tract_dask.settings import FitSettings, MetadataSettings
@@ -336,16 +337,40 @@ def test_a_set_with_a_gap_is_ambiguous():
 def test_a_user_s_prior_and_noise_enter():
     tracks = given_tracks(np.full(5, 5), 0.05, n_frames=20)
     table = given_table()
-    flat = count_atoms(tracks, table, 5.0)
+    flat = count_atoms(tracks, table, 5.0, error="stderr")
     sure = count_atoms(tracks, table, 5.0, prior=[0, 0, 0, 0, 0, 1, 0, 0])
     assert (sure["probability"].sel(n_atoms=5) == 1).all()
-    wide = count_atoms(tracks, table, 5.0, noise_scale=3.0)
+    wide = count_atoms(tracks, table, 5.0, noise_scale=3.0, error="stderr")
     assert ((wide["high_95"] - wide["low_95"]).mean() > (flat["high_95"] - flat["low_95"]).mean()).item()
     repeated = count_atoms(tracks, table, 5.0, error="repeated")
     assert float(abs(repeated["probability"] - flat["probability"]).mean()) < 0.03
     tracks["intensity_error"] = 3 * tracks["intensity_stderr"]
     poisson = count_atoms(tracks, table, 5.0, error="poisson")
     np.testing.assert_allclose(poisson["probability"], wide["probability"], atol=1e-5)
+
+
+def test_the_scatter_of_the_frames_is_the_default_error():
+    """Stated errors that are half the true ones: sets hold the truth by the scatter; by what fits state they do not.
+
+    A column that loses atoms half-way keeps its error. With few frames, or few accepted ones, stated errors do.
+    """
+    numbers = np.repeat([2, 3, 4], 14)
+    tracks = given_tracks(numbers, 0.08)
+    tracks["intensity_stderr"] = tracks["intensity_stderr"] / 2
+    table = given_table()
+    honest, claimed = share_inside(count_atoms(tracks, table, 5.0, table_error=0), numbers)
+    assert honest >= claimed - 0.02
+    stated, _ = share_inside(count_atoms(tracks, table, 5.0, table_error=0, error="stderr"), numbers)
+    assert stated < honest - 0.03
+    measured = normalised(tracks, 5.0)
+    ratio = _sigma(measured, "scatter") / (2 * measured["intensity_stderr"])
+    np.testing.assert_allclose(ratio.median("frame"), 1.0, atol=0.15)
+    falls = tracks.assign(intensity=tracks["intensity"].where(tracks["frame"] < 200, 0.5 * tracks["intensity"]))
+    np.testing.assert_allclose(
+        _sigma(normalised(falls, 5.0), "scatter")[0] / _sigma(measured, "scatter")[0], 0.75, atol=0.05
+    )
+    short = normalised(tracks.isel(frame=slice(8)), 5.0)
+    np.testing.assert_array_equal(_sigma(short, "scatter"), short["intensity_stderr"])
 
 
 def test_the_error_of_a_shape_that_all_frames_share_stays_in_the_mean():

@@ -8,7 +8,7 @@ import xarray as xr
 from scipy import stats
 
 from tract_dask import convert, fit_columns, open_movie
-from tract_dask.analysis.presence import appearances, false_alarms, p_values, present, states
+from tract_dask.analysis.presence import appearances, false_alarms, looked, p_values, present, states
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.gaussian.model import gaussian_image
 from tract_dask.kernels.presence import best_states, matched_filters, strengths
@@ -125,6 +125,15 @@ def test_without_vacuum_theory_has_to_do():
     assert not present(tracks)[1].any()
     with pytest.raises(SettingsError, match="too little vacuum"):
         false_alarms(tracks)
+
+
+def test_there_not_there_and_not_looked_at_are_three_things():
+    strength = np.array([[9.0, 0.0, np.nan], [9.0, 0.0, 9.0]])
+    tracks = tracks_of(strength, np.random.default_rng(0).normal(size=(2, 60)))
+    seen = looked(tracks)
+    np.testing.assert_array_equal(seen, [[True, True, False], [True, True, True]])
+    np.testing.assert_array_equal(seen & ~present(tracks), [[False, True, False], [False, True, False]])
+    assert not present(tracks)[0, 2]
 
 
 def test_p_values_stay_lazy():

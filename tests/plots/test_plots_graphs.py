@@ -230,6 +230,7 @@ def test_presence_is_a_raster_with_its_events(tracks):
     rng = np.random.default_rng(1)
     strength = rng.normal(size=(N_FRAMES, 6)) + 12.0
     strength[:10, 2] -= 12.0
+    strength[3:6, 4] = np.nan
     seen = tracks.assign(
         presence=(("frame", "column_id"), strength.astype("f4")),
         presence_vacuum=(("frame", "place"), rng.normal(size=(N_FRAMES, 20)).astype("f4")),
@@ -238,9 +239,10 @@ def test_presence_is_a_raster_with_its_events(tracks):
         {"column_id": ("event", [3]), "frame": ("event", [10]), "kind": ("event", np.array(["appears"], object))}
     )
     axes = plots.plot_presence(seen, events=events, false_alarm_rate=1e-4).axes[0]
-    shown = np.asarray(axes.collections[0].get_array()).reshape(6, N_FRAMES)
+    shown = np.ma.filled(axes.collections[0].get_array(), np.nan).reshape(6, N_FRAMES)
     expected = np.ones((6, N_FRAMES))
-    expected[2, :10] = 0
+    expected[2, :10], expected[4, 3:6] = 0, np.nan
+    assert "not looked at" in [text.get_text() for text in axes.get_legend().get_texts()]
     np.testing.assert_array_equal(shown, expected)
     mark = next(line for line in axes.lines if line.get_label() == "appears")
     np.testing.assert_allclose(mark.get_xydata(), [[1.0, 2]])

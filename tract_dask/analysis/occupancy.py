@@ -31,6 +31,10 @@ _ALIKE = 0.1
 """Windows and blurs of table and tracks may differ by this share."""
 _WINDOW_SLOPE = 0.5
 """A window that is wider by some share shows up to this much of it less intensity, for neighbours shine in (CeO2)."""
+_PAIRS, _SEEN, _BRIGHT = 10, 0.9, 4.0
+"""Differences between frames, share of accepted fits, and mean over scatter, from which on differences tell an error.
+
+Of faint columns fits are missing, and those of none at all scatter less than their error."""
 _ERRORS = {"stderr": "intensity_stderr", "poisson": "intensity_error"}
 
 
@@ -40,7 +44,7 @@ def count_atoms(
     vacuum: xr.Dataset | xr.DataArray | float,
     *,
     frames: str = "each",
-    error: str = "stderr",
+    error: str = "scatter",
     noise_scale: float = 1.0,
     table_error: float = 0.01,
     max_atoms: int | None = None,
@@ -60,8 +64,9 @@ def count_atoms(
     frames
         ``each``, or ``mean``: from the mean intensity of the frames in which the column was accepted.
     error
-        Of an intensity: ``stderr``, from its fit; ``poisson``, Equation 5; ``repeated``, its standard deviation over
-        the frames.
+        Of an intensity: ``scatter``, from its differences between successive frames, or as ``stderr`` where there are
+        less than ten, a tenth of the fits is not accepted, or the column is faint; ``stderr``, from its fit;
+        ``poisson``, Equation 5; ``repeated``, its standard deviation over the frames, with all that the column does.
     noise_scale
         Factor on that error, where you know it to be larger or smaller.
     table_error
@@ -102,7 +107,7 @@ def count_atoms(
     distribution cut off at the threshold.
     """
     _check_choice("frames", frames, ("each", "mean"))
-    _check_choice("error", error, (*_ERRORS, "repeated"))
+    _check_choice("error", error, ("scatter", *_ERRORS, "repeated"))
     shared_error = float(np.hypot(table_error, _WINDOW_SLOPE * _check_together(tracks, table)))
     levels = _levels(table, max_atoms, shared_error, prior)
     sign = float(np.sign(table["intensity"].mean()))
@@ -294,6 +299,14 @@ def _sigma(measured: xr.Dataset, error: str) -> xr.DataArray:
     intensity = measured["intensity"]
     if error == "repeated":
         return standard_deviation(intensity) * xr.ones_like(intensity).where(intensity.notnull())
+    if error == "scatter":
+        step = abs(intensity - intensity.shift(frame=1))
+        seen = intensity.notnull()
+        scatter: xr.DataArray = np.sqrt(np.pi) / 2 * step.mean("frame")
+        enough = (step.notnull().sum("frame") >= _PAIRS) & (seen.mean("frame") >= _SEEN)
+        enough &= abs(intensity.mean("frame")) >= _BRIGHT * scatter
+        filled: xr.DataArray = (xr.ones_like(intensity) * scatter.where(enough)).where(seen)
+        return filled.fillna(measured["intensity_stderr"])
     return measured[_ERRORS[error]]
 
 

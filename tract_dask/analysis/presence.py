@@ -112,8 +112,26 @@ def p_values(tracks: xr.Dataset) -> xr.DataArray:
     return found.assign_attrs(calibration=len(vacuum.strengths) or "theory")
 
 
+def looked(tracks: xr.Dataset) -> xr.DataArray:
+    """Return in which frames each column can be judged, (frame, column_id), as lazy as the tracks.
+
+    A column is there (:func:`present`, :func:`states`), or not there, or nothing is known: its window leaves the frame,
+    the frame is bad, or the level of the vacuum does not tell the noise at the column. Not there is therefore
+    ``looked(tracks) & ~present(tracks)``.
+
+    Raises
+    ------
+    SettingsError
+        Where the tracks have no ``presence``.
+    """
+    _check(tracks)
+    return named(xr.ufuncs.isfinite(tracks["presence"]), "1", "Whether the frame says if the column is there")
+
+
 def present(tracks: xr.Dataset, false_alarm_rate: float = 0.01) -> xr.DataArray:
     """Return in which frames each column is there, (frame, column_id), as lazy as the tracks.
+
+    False where it is not there, and where nothing is known: :func:`looked` tells these apart.
 
     Parameters
     ----------
@@ -235,7 +253,7 @@ def states(tracks: xr.Dataset, confidence: float = 0.95) -> xr.DataArray:
     """Return in which frames each column is there by the test of :func:`appearances`, (frame, column_id).
 
     It judges a frame with the help of those around it, and so sees weaker columns than :func:`present`, but no absence
-    of a few frames. False where nothing is known.
+    of a few frames. False where nothing is known: :func:`looked` tells where.
     """
     path = xr.zeros_like(tracks["presence"], dtype=np.bool_).compute()
     for column, known, there, _ in _state_paths(tracks, confidence):

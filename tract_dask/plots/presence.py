@@ -11,11 +11,13 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ..analysis.presence import present
+from ..analysis.presence import looked, present
 from ..kernels.gaussian.intensity import Floats
 from .base import LINES, PAGE_INCHES, colour_bar, graph, legend, new_figure, save, time_of
 
 _THERE = LinearSegmentedColormap.from_list("there", ["#e6e6e6", LINES[0]])
+_UNSEEN = "#f2d9a6"
+"""Where a column was not looked at."""
 _MOST_COLUMNS = 1200
 """Of the raster along time: more frames are drawn as the share of each run in which the column is there."""
 
@@ -27,7 +29,7 @@ def plot_presence(
     false_alarm_rate: float = 0.01,
     events: xr.Dataset | None = None,
 ) -> Figure:
-    """Draw in which frames each column is there, a row for each.
+    """Draw in which frames each column is there, not there, or not looked at, a row for each.
 
     Parameters
     ----------
@@ -47,13 +49,14 @@ def plot_presence(
     """
     time, time_label = time_of(tracks)
     run = -(-len(time) // _MOST_COLUMNS)
-    there = present(tracks, false_alarm_rate).transpose("column_id", "frame").astype(np.float32)
+    there = present(tracks, false_alarm_rate).where(looked(tracks)).transpose("column_id", "frame").astype(np.float32)
     share = there.coarsen(frame=run, boundary="pad").mean().to_numpy()
     ids = tracks["column_id"].to_numpy()
     figure = new_figure(PAGE_INCHES, float(np.clip(0.8 + 0.1 * len(ids), 1.8, 6.0)))
     axes = figure.subplots()
     norm = Normalize(0, 1)
     edges = _edges(time[::run], time[-1] + (time[-1] - time[0]) / max(len(time) - 1, 1))
+    axes.set_facecolor(_UNSEEN)
     axes.pcolormesh(edges, np.arange(len(ids) + 1) - 0.5, share, cmap=_THERE, norm=norm, rasterized=True)
     if events is not None:
         when = edges[np.searchsorted(tracks["frame"].to_numpy()[::run], events["frame"].to_numpy(), side="right") - 1]
@@ -66,6 +69,8 @@ def plot_presence(
     marks = axes.get_legend_handles_labels()[0]
     if run == 1:
         marks = [Patch(color=_THERE(1.0), label="there"), Patch(color=_THERE(0.0), label="not there"), *marks]
+    if np.isnan(share).any():
+        marks.append(Patch(color=_UNSEEN, label="not looked at"))
     else:
         colour_bar(axes, norm, _THERE, f"Share of {run} frames with the column")
     legend(axes, handles=marks, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1)
