@@ -41,7 +41,7 @@ def movie_of(tracks: xr.Dataset) -> SimpleNamespace:
             frames.append(image[rows, columns] / 2)
         return np.array(frames, np.float32)
 
-    return SimpleNamespace(read=read, gain=2.0, shape=(N_FRAMES, *SHAPE))
+    return SimpleNamespace(read=read, counts=lambda pixels: 2 * pixels, gain=2.0, shape=(N_FRAMES, *SHAPE))
 
 
 def titled(figure: Figure, start: str):
