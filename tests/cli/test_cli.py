@@ -305,6 +305,20 @@ def test_run_and_inspect(npy, scene, tmp_path, inline):
     assert "pixel size" in tract("inspect", out / "sum.zarr").stdout
 
 
+def test_inspect_counts_pixels_without_data(npy, scene, tmp_path, inline):
+    frames = scene.counts()
+    frames[:, [10, 30], [40, 50]] = 9000
+    frames[2, 60, 70] = 5000
+    assert tract("convert", npy(frames), tmp_path / "m.zarr").exit_code == 0
+    found = json.loads(tract("inspect", tmp_path / "m.zarr", "--json").stdout)
+    assert {name: found[name] for name in ("masked pixels", "of them hot", "spikes", "frames with a border")} == {
+        "masked pixels": 2,
+        "of them hot": 2,
+        "spikes": 1,
+        "frames with a border": 0,
+    }
+
+
 def test_frames_that_cannot_be_fitted_end_with_3(npy, scene, tmp_path, inline):
     frames = scene.counts().astype(np.float32)
     frames[3, 80, 70] = np.inf

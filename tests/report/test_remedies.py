@@ -10,11 +10,11 @@ import xarray as xr
 from conftest import Scene
 from test_report import Run
 
-from tract_dask import find_columns
+from tract_dask import convert, find_columns, fit_columns, open_movie
 from tract_dask.report import findings as room
 from tract_dask.report.findings import findings
 from tract_dask.report.survey import survey
-from tract_dask.settings import ColumnSettings, RunSettings
+from tract_dask.settings import ColumnSettings, FitSettings, RunSettings
 from tract_dask.store.schema import Status
 
 ROOT = Path(__file__).parents[2]
@@ -56,6 +56,19 @@ def test_the_right_contrast_or_none_makes_doubts_go(tmp_path, wrong, right):
         run = replace(known, found=about, tracks=found.assign_attrs(known.tracks.attrs))
         names = {finding.name for finding in room._found(run)}
         assert ("doubtful_columns" in names) == doubtful, settings
+
+
+def test_a_smaller_window_misses_fewer_pixels(tmp_path, npy):
+    scene = Scene(n_frames=8)
+    frames = scene.counts().astype("f4")
+    frames[:, :, 106] = np.nan
+    movie = open_movie(convert(npy(frames), tmp_path / "movie.zarr"))
+    missing = []
+    for window in (19, 11):
+        settings = FitSettings(window_px=window)
+        tracks = fit_columns(movie, scene.columns(), scene.drift_dataset(), settings, summed=scene.summed()).compute()
+        missing.append(int((tracks["status"].to_numpy() & Status.INCOMPLETE > 0).sum()))
+    assert missing[0] > 2 * missing[1]
 
 
 def test_a_spacing_left_unset_is_plausible(tmp_path):

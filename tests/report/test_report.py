@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import io
 import json
 import re
 from contextlib import contextmanager
@@ -12,7 +13,9 @@ import pytest
 import xarray as xr
 from conftest import Scene, store_fits
 from matplotlib import colormaps
+from matplotlib.image import imread
 
+from tract_dask import convert
 from tract_dask.analysis import overview
 from tract_dask.errors import StoreError
 from tract_dask.report import page
@@ -255,6 +258,10 @@ def _contrast_not_sure(run):
     run.found["contrast_rival"] = 0.7
 
 
+def _missing_pixels(run):
+    run.values["status"][:10, 3] = Status.INCOMPLETE
+
+
 def _doubtful(run):
     run.columns["status_ref"][1:] = Status.AT_BOUND
 
@@ -273,6 +280,7 @@ def _columns_too_near(run):
     [
         (_contrast_not_sure, {"contrast"}),
         (_lost_frames, {"lost_frames"}),
+        (_missing_pixels, {"incomplete"}),
         (_doubtful, {"doubtful_columns"}),
         (_columns_too_far_apart, {"spacing"}),
         (_columns_too_near, {"spacing"}),
@@ -294,6 +302,27 @@ def _columns_too_near(run):
 def test_warnings_are_where_they_belong(run, change, expected):
     change(run)
     assert run.names() == expected
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_pixels_without_data_are_counted_and_drawn(run, npy):
+    frames = run.scene.counts()
+    frames[:, [10, 20, 31], [40, 50, 61]] = 9000
+    frames[:, :, 100] = 0
+    convert(npy(frames), run.folder / "movie.zarr")
+    found = survey(run.write(), [])
+    text = page.render(found)
+    line = run.scene.shape[0]
+    assert f"3 hot pixels and {line} pixels in lines left out" in text
+    assert f"red: 3 hot, blue: {line} in lines" in text
+    data = text.split('<img class="mask" src="data:image/png;base64,')[1].split('"')[0]
+    colours = imread(io.BytesIO(base64.b64decode(data)))[..., :3]
+    assert np.ptp(colours[10, 40]) > 0.5
+    assert np.ptp(colours[90, 20]) == 0
+    assert "masked_pixels" not in {finding.name for finding in findings(found)}
+    counts = found.left_out | {"hot": found.summed["image"].size // 50}
+    many = dataclasses.replace(found, about=found.about | {"movie": found.about["movie"] | {"pixels": counts}})
+    assert "masked_pixels" in {finding.name for finding in findings(many)}
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..store.camera import ATTRIBUTE, Camera
+from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
 from .camera import camera_findings
@@ -42,6 +43,8 @@ DOUBTFUL, MANY_DOUBTFUL = 0.2, 0.5
 """Share of the columns whose fits on the summed image may be flagged: where the spacing was given, and always."""
 SPACINGS = 0.6, 1.6
 """Distance of the columns, in periods of the image, between which it may be."""
+MASKED = 0.01
+"""Share of the pixels that the mask may hold: cameras have far fewer faulty ones."""
 _NAMED = 10
 
 
@@ -72,7 +75,20 @@ class Finding:
 
 def findings(run: Survey) -> list[Finding]:
     """Return what there is to know of a run, warnings first."""
-    checks = (_mixed, _calibration, _camera, _found, _acceptance, _columns, _frames, _flags, _errors, _drift, _told)
+    checks = (
+        _mixed,
+        _calibration,
+        _camera,
+        _pixels,
+        _found,
+        _acceptance,
+        _columns,
+        _frames,
+        _flags,
+        _errors,
+        _drift,
+        _told,
+    )
     found = [finding for check in checks for finding in check(run)]
     return sorted(found, key=lambda finding: not finding.serious)
 
@@ -133,6 +149,27 @@ def _camera(run: Survey) -> Iterator[Finding]:
     level = float(np.median(image)) / said["gain"] + said["offset"] if image.size else 0.0
     for words in camera_findings(Camera.of(run.summed.attrs), said["gain"], said["offset"], level):
         yield Finding("camera", **words)
+
+
+def _pixels(run: Survey) -> Iterator[Finding]:
+    """Tell where many pixels carry no data, and which columns miss some."""
+    counts, size = run.left_out, run.summed["image"].size
+    kinds = [f"{counts[name]:,} {name}" for name in KINDS.values() if name in counts]
+    masked = sum(counts.get(name, 0) for name in KINDS.values())
+    if masked > MASKED * size:
+        text = f"{masked:,} pixels ({masked / size:.1%}) are left out of all frames: {', '.join(kinds)}."
+        remedy = "Look at the mask, below. Where it is wrong, run again with --set convert.find_defects=false."
+        yield Finding("masked_pixels", "Many pixels carry no data", text, remedy)
+    missing, ids = run.columns["incomplete"].to_numpy(), run.columns["column_id"].to_numpy()
+    some = missing > 0
+    if some.any():
+        most = ids[np.argsort(-missing, kind="stable")][: int(some.sum())]
+        text = (
+            f"Pixels are missing in {count(int(missing.sum()), 'window')} of {_of_columns(most)}. These fits are made "
+            "to the pixels that are there: their stated errors are wider, and where too few are there none is accepted."
+        )
+        remedy = "Nothing is wrong. A smaller --window-px keeps away from borders and lines without data."
+        yield Finding("incomplete", "Some windows miss pixels", text, remedy, serious=False)
 
 
 def _found(run: Survey) -> Iterator[Finding]:

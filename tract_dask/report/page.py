@@ -21,15 +21,17 @@ from ..analysis.jumps import change_points
 from ..errors import TractError
 from ..settings.declare import Settings
 from ..settings.run import RunSettings
+from ..stages.convert.defects import FEWEST_FRAMES
 from ..store import files, metadata
 from ..store.keys import digest_of
+from ..store.pixels import in_words, pixels_of
 from ..store.results import part_in_words
 from ..store.run_folder import RunFolder
 from ..web import bundle
 from ..web.bundle import STATIC
 from . import interactive
 from .findings import RESIDUAL, count, findings
-from .pictures import figure_data, windows_data
+from .pictures import MASK_COLOURS, figure_data, mask_data, windows_data
 from .survey import Survey, events_of, median, percentiles, residuals, survey
 
 _SCRIPT = Path(__file__).parent / "page.js"
@@ -40,6 +42,7 @@ _WORST = 6
 _JUMP_WORK = 8e8
 """Change points are looked for where columns times the square of the frames is no more: about a second."""
 _JUMP_CONFIDENCE = 0.99
+_KIND_WORDS = {"lines": "in lines"}
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,7 @@ def render(run: Survey, key: str = "", *, figures: bool = True) -> str:
         worst=worst_columns(run),
         residual_limit=RESIDUAL,
         windows=_windows(run),
+        mask=mask_picture(run),
         pictures=list(_pictures(run)) if figures else [],
         unit=run.known.unit,
         measured=measured(run),
@@ -211,7 +215,7 @@ def quality(run: Survey) -> list[str]:
         else "All windows stay inside the image in every frame."
     )
     bad = int(run.frames["bad"].sum())
-    said.append(f"{count(bad, 'frame')} could not be fitted (NaN or infinite pixels)." if bad else "No frame is bad.")
+    said.append(f"{count(bad, 'frame')} could not be fitted: they show nothing." if bad else "No frame is bad.")
     return said
 
 
@@ -286,6 +290,32 @@ def _pictures(run: Survey) -> Iterator[Picture]:
             yield Picture(title, f"This figure could not be made: {error}", "")
 
 
+def mask_picture(run: Survey) -> Picture | None:
+    """Return which pixels are left out of all frames; None where none are, or the movie is gone or damaged."""
+    if "mask" not in run.left_out.get("arrays", ()):
+        return None
+    try:
+        mask = pixels_of(RunFolder(run.folder).movie, run.about["movie"]["key"]).mask
+    except TractError:
+        return None
+    if mask is None:
+        return None
+    colours = ((name, colour.removeprefix("tab:")) for name, colour in MASK_COLOURS.items() if name in run.left_out)
+    kinds = [f"{colour}: {run.left_out[name]:,} {_KIND_WORDS.get(name, name)}" for name, colour in colours]
+    caption = f"Pixels that are left out of all frames. {', '.join(kinds)}. A pixel is drawn larger than it is."
+    return Picture("Mask", caption, mask_data(mask))
+
+
+def _left_out(run: Survey) -> str:
+    """Return in words which pixels carry no data."""
+    if run.settings and not run.settings.convert.find_defects:
+        return "not looked for (find_defects is off)"
+    found = in_words(run.left_out)
+    if run.frames.sizes["frame"] < FEWEST_FRAMES:
+        found.append(f"hot pixels and spikes are not looked for in fewer than {FEWEST_FRAMES} frames")
+    return ", ".join(found) or "none found"
+
+
 def measured(run: Survey) -> list[tuple[str, str]]:
     """Return what was measured: names and values."""
     known, movie = run.tracks.attrs, run.about["movie"]
@@ -295,6 +325,7 @@ def measured(run: Survey) -> list[tuple[str, str]]:
         "Movie": _source(run),
         "Format": movie.get("source_format"),
         "Frames": f"{shape[0]:,} of {shape[2]:,} × {shape[1]:,} px ({movie.get('dtype', 'dtype not known')})",
+        "Pixels without data": _left_out(run),
         "Part of the source": part_in_words(movie.get("part")),
         "Size of a pixel": f"{known['pixel_size_pm']:g} pm" if run.known.unit == "pm" else "not known",
         "Field of view": f"{shape[2] * run.known.scale / 1000:.3g} × {shape[1] * run.known.scale / 1000:.3g} nm"

@@ -10,8 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 _QUALITY = 88
+_MASK_POINTS = 480
+
+MASK_COLOURS = {"hot": "tab:red", "dead": "black", "lines": "tab:blue", "given": "tab:purple"}
+"""By kind, in the order of :data:`tract_dask.store.pixels.KINDS`."""
 
 
 def figure_data(figure: Figure, dpi: float) -> str:
@@ -48,6 +53,22 @@ def windows_data(shown: NDArray[np.float64]) -> str:
         panel[beyond] = 0.0
     file = io.BytesIO()
     imsave(file, np.concatenate([panels[0], gap, panels[1], gap, panels[2]], axis=1), format="png")
+    return _url(file.getvalue(), "png")
+
+
+def mask_data(mask: NDArray[np.uint8]) -> str:
+    """Return which pixels are masked (y, x), by kind in :data:`MASK_COLOURS`, as a data URL (PNG).
+
+    A point of the picture has the kind with the highest number of its pixels; single ones are drawn 3 points wide.
+    """
+    step = -(-max(mask.shape) // _MASK_POINTS)
+    rows, columns = (-(-side // step) for side in mask.shape)
+    whole = np.zeros((rows * step, columns * step), np.uint8)
+    whole[: mask.shape[0], : mask.shape[1]] = mask
+    shown = maximum_filter(whole.reshape(rows, step, columns, step).max(axis=(1, 3)), 3)
+    palette = np.array([mpl.colors.to_rgb(colour) for colour in ("0.9", *MASK_COLOURS.values())])
+    file = io.BytesIO()
+    imsave(file, palette[shown], format="png")
     return _url(file.getvalue(), "png")
 
 

@@ -23,6 +23,7 @@ from ..settings.run import RunSettings
 from ..settings.toml import load
 from ..store import datasets, metadata, results, schema
 from ..store.files import read_small
+from ..store.pixels import GROUP
 from ..store.run_folder import RunFolder
 from ..store.strangers import strangers
 
@@ -87,6 +88,12 @@ class Survey:
     def fits(self) -> int:
         """Fits that were made."""
         return int(self.columns["fits"].sum())
+
+    @property
+    def left_out(self) -> dict[str, Any]:
+        """How many pixels of the movie carry no data, see :meth:`tract_dask.store.pixels.Pixels.counts`."""
+        counts: dict[str, Any] = self.about["movie"].get(GROUP, {})
+        return counts
 
     @property
     def accepted(self) -> int:

@@ -18,7 +18,8 @@ from ..readers.times import has_stamps
 from ..settings.run import RunSettings
 from ..store import datasets, metadata, schema
 from ..store.camera import Camera
-from ..store.movie import open_movie
+from ..store.movie import Movie, open_movie
+from ..store.pixels import KINDS
 from ..store.results import open_results, part_in_words
 from ..store.run_folder import STORES, RunFolder
 
@@ -92,9 +93,18 @@ def _movie(path: Path) -> dict[str, Any]:
         "offset, detector units": movie.offset,
         "shards": len(movie.shards),
         "binned levels": list(movie.bins),
+        **_left_out(movie),
         "frames with pixels that are missing": int(missing.sum()),
         "bad frames": int(bad.sum()),
     }
+
+
+def _left_out(movie: Movie) -> dict[str, int]:
+    """Return how many pixels carry no data: of the mask, and by why they are in it; spikes; frames with a border."""
+    counts = movie.pixels.counts(movie.shape[1:])
+    kinds = {f"of them {name}": counts[name] for name in KINDS.values() if name in counts}
+    rest = {name: counts.get(name, 0) for name in ("spikes", "frames with a border")}
+    return {"masked pixels": sum(kinds.values())} | kinds | rest
 
 
 def _frames(shape: tuple[int, int, int], dtype: np.dtype[Any]) -> dict[str, Any]:

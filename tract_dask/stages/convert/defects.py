@@ -17,7 +17,7 @@ from ...store.arrays import DamagedArrayError, load_saved, save_array
 from ...store.pixels import Pixels
 
 _SAMPLE_FRAMES = 32
-_FEWEST_FRAMES = 6
+FEWEST_FRAMES = 6
 """With fewer a hot pixel cannot be told from a spike."""
 
 
@@ -74,7 +74,7 @@ def _load(folder: Path) -> Finder:
 def _history(source: FrameSource) -> History | None:
     """Return what pairs of frames, spread over the movie, tell of its pixels."""
     n_frames = source.shape[0]
-    if n_frames < _FEWEST_FRAMES:
+    if n_frames < FEWEST_FRAMES:
         return None
     moments, pairs = Moments(source.shape[1:]), _SAMPLE_FRAMES // 2
     whole = n_frames <= _SAMPLE_FRAMES
