@@ -194,7 +194,7 @@ def test_weak_columns_are_found(estimator, size, sigma, found):
 @pytest.mark.parametrize(("height", "level"), [(300, 300), (-500, 1000)])
 @pytest.mark.parametrize("fixed", [True, False])
 def test_no_fit_is_lost_where_rounding_hides_the_last_falls(height, level, fixed):
-    """A column as wide as its window, with a neighbour: four in a hundred ended without a verdict before."""
+    """A column as wide as its window, with a neighbour: each fit ends with a verdict."""
     halo, size, rng = 9, 21, np.random.default_rng(2)
     truth = np.tile([height, 0, 0, 6.6, 5.4, 0.4, level], (600, 1))
     truth[:, 1:3] = size // 2 + rng.uniform(-0.5, 0.5, (600, 2))

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from tract_dask import sum_image
+from tract_dask.errors import InputError
 from tract_dask.kernels.noise import Cells, fit_law
 from tract_dask.report.camera import camera_findings
 from tract_dask.stages.noise import measure_camera
+from tract_dask.stages.sum import _measured
 from tract_dask.store.camera import NOT_MEASURED, Camera
 
 SHAPE = (192, 192)
@@ -164,3 +166,26 @@ def test_the_sum_is_above_the_offset_and_names_the_camera(tmp_path):
     summed = sum_image(movie)
     np.testing.assert_allclose(summed["image"], counts.mean(axis=0), rtol=1e-6)
     assert Camera.of(summed.attrs) is not NOT_MEASURED
+
+
+@pytest.mark.parametrize(
+    ("wanted", "offset", "shared", "known"),
+    [
+        (("gain",), 0.0, 3.0, False),  # 96.6 counts without noise, and no offset said
+        (("gain", "offset"), 0.0, 3.0, False),
+        (("gain",), 100.0, 3.0, True),
+        (("gain", "offset"), 0.0, 1.0, True),
+        (("offset",), 0.0, 3.0, True),
+    ],
+)
+def test_a_gain_that_read_noise_may_have_spoilt_is_refused(wanted, offset, shared, known):
+    ring = [(shared - 1) / 8] * 4
+    correlation = None if shared == 1 else ((*ring[:3],), (ring[0], 1.0, ring[0]), (*ring[:3],))
+    camera = Camera(per_electron=3.2, per_electron_stderr=0.1, zero=96.6, zero_stderr=0.5, correlation=correlation)
+    movie = SimpleNamespace(to_measure=wanted, offset=offset, gain=1.0, path="movie.zarr", n_frames=40)
+    summed = SimpleNamespace(attrs=camera.to_attribute())
+    if known:
+        assert _measured(movie, summed)[0] == (1 / 3.2 if "gain" in wanted else 1.0)
+    else:
+        with pytest.raises(InputError, match="share their electrons"):
+            _measured(movie, summed)

@@ -34,6 +34,11 @@ Bools = NDArray[np.bool_]
 SUM_PARTS = 16
 """The sum is made in at most this many parts, whatever the number of workers."""
 
+_SHARED = 1.5
+"""Sum of the noise's autocorrelation from which read noise, which pixels do not share, matters for the gain."""
+_SURE = 4.0
+"""Standard errors by which the level without noise must be above the offset."""
+
 
 def sum_image(
     movie: Movie,
@@ -181,6 +186,13 @@ def _scale(movie: Movie) -> tuple[Part, ...]:
     return (movie.gain, movie.offset) if movie.offset else (movie.gain,)
 
 
+def _hides_read_noise(camera: Camera, offset: float | None) -> bool:
+    """Tell whether pixels share electrons, and the offset, or None, does not tell how much read noise is with them."""
+    if camera.shared.sum() < _SHARED or camera.zero is None:
+        return False
+    return offset is None or offset < camera.zero - _SURE * (camera.zero_stderr or 0.0)
+
+
 def _measured(movie: Movie, summed: xr.Dataset) -> tuple[float, float]:
     """Return the gain and the offset of a movie, from its camera where they are to be measured."""
     wanted, camera = movie.to_measure, Camera.of(summed.attrs)
@@ -191,6 +203,14 @@ def _measured(movie: Movie, summed: xr.Dataset) -> tuple[float, float]:
             "vacuum and columns of different brightness in a dozen frames or more",
             f"{movie.n_frames} frames",
             f"Give {' and '.join(f'--{name}' for name in wanted)} as numbers",
+        )
+    if "gain" in wanted and _hides_read_noise(camera, None if "offset" in wanted else movie.offset):
+        raise InputError(
+            "the gain cannot be measured: pixels share their electrons, but not their read noise",
+            str(movie.path),
+            "an offset that is known, which tells how much of the noise is read noise",
+            "no offset" if "offset" in wanted else f"an offset of {movie.offset:.4g}",
+            "Give the level of a frame without beam as --offset, or the gain as --gain",
         )
     gain = 1 / camera.per_electron if "gain" in wanted and camera.per_electron else movie.gain
     level = camera.zero if camera.offset is None else camera.offset
