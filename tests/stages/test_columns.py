@@ -425,8 +425,8 @@ def test_columns_from_a_csv_file(tmp_path: Path) -> None:
 def test_what_was_written_is_read_back_and_found_again(tmp_path: Path) -> None:
     image = summed(image_of(np.concatenate([crystal(), [[3.0, 100.0]]]), 5), noise=0.3)
     columns = find_columns(image)
-    (tmp_path / "columns.csv")
-    read = read_columns_csv(tmp_path / "columns.csv").write_text(columns_csv(columns))
+    (tmp_path / "columns.csv").write_text(columns_csv(columns))
+    read = read_columns_csv(tmp_path / "columns.csv")
     xr.testing.assert_identical(read, columns.drop_attrs(deep=False))
     again = find_columns(image, ColumnSettings(method="csv", csv=str(tmp_path / "columns.csv")))
     np.testing.assert_allclose(positions(again), positions(columns), atol=1e-2)

@@ -273,7 +273,7 @@ def test_fits_move_and_change_their_unit_without_a_trace_in_the_ones_before():
     windows = np.ones((2, 3))
     fits = FrameFits(
         **dict.fromkeys(("estimates", "stderr"), np.ones((2, 3, 7))),
-        **dict.fromkeys(("volume_stderr", "strength", "residual"), windows),
+        **dict.fromkeys(("volume_stderr", "strength", "residual", "ratio"), windows),
         **dict.fromkeys(("converged", "at_bound", "held", "incomplete"), windows > 0),
         r_squared=windows.astype("f4"),
         n_iterations=windows.astype("i2"),

@@ -13,7 +13,7 @@ from ..store import results, schema
 from .sites import fit_sites
 from .weights import blocks, drawn_together, scatter_of
 
-_AROUND = 100
+AROUND = 100
 """Frames on each side of a frame that say how large a column's error is there."""
 _FEWEST = 10
 """Accepted frames from which on the scatter of places scales their errors."""
@@ -186,7 +186,7 @@ def displacement(tracks: xr.Dataset, first: int, second: int) -> xr.Dataset:
                 "there is no such frame", "displacement", f"a frame from {frames[0]} to {frames[-1]}", f"{frame}"
             )
     numbers = [int(np.flatnonzero(frames == frame)[0]) for frame in (first, second)]
-    around = sorted({k for n in numbers for k in range(max(n - _AROUND, 0), min(n + _AROUND + 1, len(frames)))})
+    around = sorted({k for n in numbers for k in range(max(n - AROUND, 0), min(n + AROUND + 1, len(frames)))})
     place, stated = (
         values.isel(frame=around).transpose("frame", "column_id", "axis")
         for values in (positions(tracks), standard_errors(tracks))

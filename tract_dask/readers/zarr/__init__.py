@@ -222,7 +222,8 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
     known = {name: as_number(store.get(name)) for name in ("pixel_size_pm", "frame_time_s", "dose", "gain", "offset")}
     gain = _or_none(known["gain"]) or 1.0
     offset = _or_none(known["offset"]) or 0.0
-    note = f"{path.name}: the movie was converted with a gain of {gain:g} and an offset of {offset:g}, which are used"
+    level = f" and an offset of {offset:g}, which are used" if offset else ", which is used"
+    note = f"{path.name}: the movie was converted with a gain of {gain:g}{level}"
     return replace(
         said,
         pixel_size_pm=_or_none(known["pixel_size_pm"]),

@@ -160,7 +160,7 @@ def displacement(folder: Path, first: int, second: int, version: str) -> bytes:
         Where there is no such frame.
     """
     path = RunFolder(folder).results
-    tracks, known = _only(path, (first, second)), _calibration(path)
+    tracks, known = _around(path, (first, second), motion.AROUND), _calibration(path)
     moved = motion.displacement(tracks, first, second)
     values = {
         f"{name}_{axis}": moved[variable].sel(axis=axis).to_numpy()
@@ -182,8 +182,8 @@ def _rows(table: dict[str, list[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
 
-def _only(path: Path, frames: tuple[int, ...]) -> xr.Dataset:
-    """Return the fits of a few frames, in memory; those of frames that are not done are not accepted.
+def _around(path: Path, frames: tuple[int, ...], reach: int) -> xr.Dataset:
+    """Return the fits of frames up to ``reach`` from some, in memory; those of frames that are not done do not count.
 
     Raises
     ------
@@ -194,16 +194,18 @@ def _only(path: Path, frames: tuple[int, ...]) -> xr.Dataset:
     opened = results.variables(path)
     arrays = {name: opened(name) for name in (*results.FITTED, "status")}
     n_frames, step = arrays["fit"].shape[0], arrays["fit"].chunks[0]
-    wanted = sorted(set(frames))
-    outside = [frame for frame in wanted if not 0 <= frame < n_frames]
+    outside = [frame for frame in sorted(frames) if not 0 <= frame < n_frames]
     if outside:
         raise InputError("there is no such frame", "frame", f"0 to {n_frames - 1}", f"{outside[0]}")
+    near = (range(max(0, frame - reach), min(n_frames, frame + reach + 1)) for frame in frames)
+    wanted = np.unique(np.concatenate(list(near)))
+    runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
     coordinates = {"frame": wanted, "parameter": list(parameters.PARAMETERS)}
     tracks = _static(path).assign_coords(coordinates).assign_attrs(pixel_size_pm=_calibration(path).scale)
     for name, array in arrays.items():
-        values = np.stack([np.asarray(array[frame]) for frame in wanted])
+        values = np.concatenate([np.asarray(array[run[0] : run[-1] + 1]) for run in runs])
         tracks[name] = (schema.RESULTS[name].dims, values)
-    done = xr.DataArray(finished[np.array(wanted) // step], dims="frame")
+    done = xr.DataArray(finished[wanted // step], dims="frame")
     return tracks.assign(status=tracks["status"].where(done, np.uint8(schema.Status.NOT_CONVERGED)))
 
 
