@@ -19,7 +19,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TypeAlias
 
-from ..errors import DestinationError
+from ..errors import DestinationError, StoreError
 
 Identity: TypeAlias = tuple[int, int]
 """Device and number of a folder; no other has them while it is open."""
@@ -114,6 +114,9 @@ def hold(place: Path | Folder, *, links: bool = True) -> Iterator[Folder]:
         try:
             folder.check()
             yield folder
+        except (OSError, StoreError):
+            folder.check()  # which says why a file is not there that was a moment ago
+            raise
         finally:
             with _changing:
                 _held[path].remove(folder)
