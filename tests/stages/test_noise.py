@@ -189,3 +189,20 @@ def test_a_gain_that_read_noise_may_have_spoilt_is_refused(wanted, offset, share
     else:
         with pytest.raises(InputError, match="share their electrons"):
             _measured(movie, summed)
+
+
+def test_a_hot_pixel_leaves_no_hole_in_the_sum_whose_offset_is_measured(tmp_path):
+    from tract_dask import convert, open_movie
+    from tract_dask.settings import MetadataSettings
+    from tract_dask.stages.sum import sum_stage
+
+    counts, _, _ = frames_of(n=24, moving=0.0)
+    pixels = (5 * counts + 100).astype(np.uint16)
+    pixels[:, 90, 100] = 4000
+    np.save(tmp_path / "movie.npy", pixels)
+    known = MetadataSettings(gain="auto", offset="auto")
+    movie = open_movie(convert(tmp_path / "movie.npy", tmp_path / "movie.zarr", metadata=known))
+    summed = sum_stage(movie, None, tmp_path / "sum.zarr", lambda: None)
+    assert summed["exposure"][90, 100] == 0
+    around = summed["image"][88:93, 98:103]
+    assert float(around.min()) < float(around[2, 2]) < float(around.max())

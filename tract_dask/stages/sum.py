@@ -170,7 +170,8 @@ def sum_stage(
             return summed
         gain, offset = _measured(movie, summed)
         image = (summed["image"] / movie.gain + movie.offset - offset) * gain
-        return summed.assign(image=image.where(summed["exposure"] > 0, 0.0).assign_attrs(summed["image"].attrs))
+        known = (summed["exposure"] > 0) | (summed["image"] != 0)  # what was filled is not 0
+        return summed.assign(image=image.where(known, 0.0).assign_attrs(summed["image"].attrs))
 
     summed = kept("sum", movie, path, key, Settings(), make, on_event)
     gain, offset = _measured(movie, summed)
