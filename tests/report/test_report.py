@@ -245,6 +245,11 @@ def _two_in_one(run):
     run.values["p_value"][::4, 1] = 1e-6
 
 
+def _one_unlikely_fit_of_few(run):
+    run.values["status"][3:, 1] |= Status.BELOW_NOISE
+    run.values["p_value"][0, 1] = 5e-4
+
+
 def _noise_of_another_kind(run):
     run.values["p_value"][::4] = 1e-6
 
@@ -296,6 +301,7 @@ def _columns_too_near(run):
         (_drift_step, {"long_step"}),
         (_odd_column, {"residual"}),
         (_two_in_one, {"one_gaussian"}),
+        (_one_unlikely_fit_of_few, {"weak_columns"}),
         (_noise_of_another_kind, set()),
     ],
 )

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtrc
 
+from ..analysis.overview import UNLIKELY
 from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
@@ -37,6 +39,8 @@ RESIDUAL = 0.15
 UNLIKE, UNLIKE_OTHERS = 0.1, 5.0
 """A column is not one Gaussian where a larger share of its fits is unlike one, and larger by this factor than usual:
 noise that is not as the fit takes it is so in all columns."""
+BY_CHANCE = 0.01
+"""Probability that chance names a column in a movie in which all are one Gaussian."""
 RIVAL = 0.5
 """Share of the support for one contrast that the other one may have."""
 DOUBTFUL, MANY_DOUBTFUL = 0.2, 0.5
@@ -242,9 +246,7 @@ def _columns(run: Survey) -> Iterator[Finding]:
         )
         remedy = "See the residuals below; a smaller window (--window-px) keeps neighbours out."
         yield Finding("residual", "Some columns do not look like Gaussians", text, remedy)
-    accepted = np.maximum(columns["accepted"].to_numpy(), 1)
-    share = columns["unlike"].to_numpy() / accepted
-    unlike = (share > UNLIKE) & (share > UNLIKE_OTHERS * np.median(share)) & ~poor
+    unlike = _unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy()) & ~poor
     if unlike.any():
         text = (
             f"More than {UNLIKE:.0%} of the fits leave far more than the noise for {_of_columns(ids[unlike])}: "
@@ -252,6 +254,14 @@ def _columns(run: Survey) -> Iterator[Finding]:
         )
         remedy = "Look at them in the summed image; add the column that is missing to columns.csv and run again."
         yield Finding("one_gaussian", "One Gaussian is not enough here", text, remedy)
+
+
+def _unlike_one(number: NDArray[np.int64], accepted: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which columns have too many fits that are unlike one Gaussian: more than chance has in any of them."""
+    share = number / np.maximum(accepted, 1)
+    usual = float(np.median(share))
+    chance = bdtrc(number - 1, accepted, min(UNLIKELY + usual, 1.0))
+    return np.asarray((share > UNLIKE) & (share > UNLIKE_OTHERS * usual) & (chance < BY_CHANCE / len(number)))
 
 
 def _of_columns(ids: NDArray[np.int64]) -> str:
