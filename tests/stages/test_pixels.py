@@ -131,3 +131,17 @@ def test_columns_are_found_without_the_hot_pixels(make, scene):
     nearest = np.hypot(*(places[:, None] - scene.place).transpose(2, 0, 1)).min(axis=1)
     assert len(places) == len(scene.place)
     assert nearest.max() < 0.5
+
+
+def test_hot_pixels_cost_no_column_its_reference_where_nothing_drifts(make):
+    """Forty of them, in the windows of most columns: as without them within 0.1 px and 5 % of the amplitude."""
+    scene = Scene(n_frames=24, amplitude=30.0, background=10.0, max_drift=0.0)
+    frames, _ = spoiled(scene, "hot")
+    movie, _ = make(frames)
+    found = find_columns(sum_image(movie))
+    sound = find_columns(sum_image(make(scene.counts())[0]))
+    assert found.sizes == sound.sizes
+    np.testing.assert_array_equal(found["status_ref"], sound["status_ref"])
+    difference = (found["fit_ref"] - sound["fit_ref"]).to_numpy()
+    assert np.nanmax(np.abs(difference[:, 1:3])) < 0.1
+    assert np.nanmax(np.abs(difference[:, 0] / sound["fit_ref"].to_numpy()[:, 0])) < 0.05

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...errors import InputError, SettingsError
+from ...kernels.filling import fill_near
 from ...kernels.gaussian.fit import GaussianFits, fit_gaussians
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.magnitude import unit_of
@@ -22,7 +23,18 @@ from ...store.columns import check_inside, column_dataset, positions, read_colum
 from ...store.schema import Status
 from .contrast import SIGNS, chosen, support
 from .detect import METHODS, make_detector
-from .lattice import Lattice, Places, Relief, damping, find_lattice, find_peaks, pixel_noise, relief, sample
+from .lattice import (
+    Lattice,
+    Places,
+    Relief,
+    damping,
+    find_lattice,
+    find_peaks,
+    pixel_noise,
+    relief,
+    sample,
+    without_holes,
+)
 from .sites import lattice_sites
 from .window_size import neighbour_distance, resolve_window
 
@@ -220,7 +232,10 @@ def _scene(summed: xr.Dataset, blur_sigma_px: float) -> _Scene:
             "the summed image is empty", "columns", "exposed pixels", "none", "Check the drift: it may leave no overlap"
         )
     if not valid.all():
-        counts = np.where(valid, counts, np.median(sample(counts[valid])))
+        whole = without_holes(valid)
+        near = fill_near(np.where(valid, counts, np.nan)) if (whole & ~valid).any() else counts
+        counts = np.where(valid, counts, np.where(whole, near, np.median(sample(counts[valid]))))
+        valid = whole
     unit = unit_of(counts)
     counts = counts if unit == 1 else counts / unit
     return _Scene(counts, counts, valid, SIGNS["bright"], pixel_noise(counts, valid), blur_sigma_px, unit)

@@ -41,6 +41,8 @@ _COARSE = 16
 """Smoothing by so many px or more is done on bins of a sixteenth of it."""
 _LEVEL_BINS = 8
 """Bins in the reach of the background's median."""
+_HOLE_PX = 5
+"""Holes less wide than this are those of single pixels, small clusters, and short lines of them."""
 _SAMPLE = 1 << 20
 """Of more values than these, statistics are taken from a sample."""
 _STRONG = 0.5
@@ -260,6 +262,23 @@ def _level(image: Reals, reach: float) -> Reals:
 def _coarseness(sigma: float) -> int:
     """Return how far an image may be binned before it is smoothed by ``sigma`` px."""
     return max(1, int(sigma / _COARSE))
+
+
+def without_holes(there: Mask) -> Mask:
+    """Return which pixels (y, x) are there, and those of the small holes between them.
+
+    Examples
+    --------
+    >>> there = np.ones((9, 9), bool)
+    >>> there[4, 4] = there[:, 0] = False
+    >>> whole = without_holes(there)
+    >>> bool(whole[4, 4]), bool(whole[4, 0])
+    (True, False)
+    """
+    side = 2 * _HOLE_PX
+    closed = ndimage.binary_closing(np.pad(there, side, mode="edge"), np.ones((_HOLE_PX, _HOLE_PX), np.bool_))
+    whole: Mask = there | (closed[side:-side, side:-side] & ndimage.binary_fill_holes(there))
+    return whole
 
 
 def pixel_noise(image: Reals, valid: Mask) -> float:

@@ -13,13 +13,13 @@ from ...errors import SettingsError
 from ...kernels.gaussian.parameters import AMPLITUDE
 from ...kernels.magnitude import unit_of
 from ...kernels.windows import blur
+from ..columns.lattice import without_holes
 
 _SHARES = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8)
 _FLAT = 0.1
 _MIN_SIDE_PX = 24
 _PADDING_PX, _EDGE = 17, 0.05
 """Padding is a square of this side at least, whose edge is this share of the columns' amplitude."""
-_HOLE_PX = 5
 _STEPS = 16
 """Squares are looked for in steps of this share of the smallest one's side."""
 
@@ -49,7 +49,7 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
     smooth = blur((image if unit == 1 else image / unit).astype(np.float32), sigma)
     smooth -= smooth.mean(dtype=np.float64)
     amplitude = float(np.nanmedian(np.abs(columns["fit_ref"].to_numpy()[:, AMPLITUDE]))) / unit
-    covered = _without_holes(exposure == exposure.max()) & ~_is_padding(image / unit, amplitude)
+    covered = without_holes(exposure == exposure.max()) & ~_is_padding(image / unit, amplitude)
     sides = [side for share in _SHARES if (side := int(share * min(image.shape))) >= _MIN_SIDE_PX]
     step = max(1, min(sides, default=1) // _STEPS)
     sides = [side // step * step for side in sides]
@@ -104,14 +104,6 @@ def check_box(
             str(box),
             "Move it inwards or make it smaller",
         )
-
-
-def _without_holes(covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the same with the holes that single pixels without data, and lines of them, leave in some frames."""
-    side = 2 * _HOLE_PX
-    closed = ndimage.binary_closing(np.pad(covered, side, mode="edge"), np.ones((_HOLE_PX, _HOLE_PX), np.bool_))
-    whole: NDArray[np.bool_] = covered | (closed[side:-side, side:-side] & ndimage.binary_fill_holes(covered))
-    return whole
 
 
 def _is_padding(image: NDArray[np.float64], amplitude: float) -> NDArray[np.bool_]:
