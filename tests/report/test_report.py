@@ -246,7 +246,7 @@ def _two_in_one(run):
 
 
 def _one_unlikely_fit_of_few(run):
-    run.values["status"][3:, 1] |= Status.BELOW_NOISE
+    run.values["status"][3:, 1] = Status.BELOW_NOISE
     run.values["p_value"][0, 1] = 5e-4
 
 
