@@ -1,5 +1,6 @@
 """Whether a column is there: the matched filter against closed forms, its calibration, and events, all simulated."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -61,6 +62,24 @@ def test_a_slope_is_no_column():
     windows = np.stack([0.3 * x, -0.2 * y, 7.0 + 0 * x]).astype(np.float32)
     found = strengths(windows, matched_filters(COLUMN[None], 21, 2.0), np.zeros(3, np.int64))
     np.testing.assert_allclose(found, 0, atol=2e-5)
+
+
+def test_filters_of_many_columns_take_little_more_memory_than_they_keep():
+    """And each is that of the same column alone, whichever block it is made in."""
+    rng, size = np.random.default_rng(0), 41
+    shapes = np.tile(COLUMN, (3000, 1))
+    shapes[:, 3:5] = rng.uniform(3, 8, (3000, 2))
+    tracemalloc.start()
+    try:
+        filters = matched_filters(shapes, size, 2.0)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < filters.weights.nbytes + 32e6
+    for k in (0, 155, 156, 2999):
+        alone = matched_filters(shapes[k : k + 1], size, 2.0)
+        np.testing.assert_allclose(filters.weights[k], alone.weights[0], atol=1e-7)
+    assert matched_filters(shapes[:0], size, 2.0).weights.shape == (0, *alone.weights.shape[1:])
 
 
 def test_each_window_has_its_own_filter():

@@ -18,13 +18,14 @@ from matplotlib.image import imread
 from tract_dask import convert
 from tract_dask.analysis import overview
 from tract_dask.errors import StoreError
+from tract_dask.kernels.gaussian.model import evaluate
 from tract_dask.report import page
 from tract_dask.report import survey as survey_module
 from tract_dask.report.findings import findings
 from tract_dask.report.interactive import quantised, script_json
 from tract_dask.report.look import look
 from tract_dask.report.page import cards, is_current, write_report
-from tract_dask.report.survey import gathered, survey
+from tract_dask.report.survey import gathered, residual_windows, residuals, survey
 from tract_dask.service.api.results import _REPORT_POLICY
 from tract_dask.service.views import tracks as tracks_of_job
 from tract_dask.settings import ColumnSettings, FitSettings, RunSettings, to_toml
@@ -758,3 +759,20 @@ def test_a_look_writes_the_page_once(run):
     run.settings = RunSettings(columns=ColumnSettings(spacing_px=15.0))
     (run.folder / "run.toml").write_text(to_toml(run.settings))
     assert look(run.folder)[1] is False
+
+
+def test_residuals_are_those_of_the_windows():
+    """A column that is its model leaves the noise; one beyond the image, or not fitted, has none."""
+    reference = np.array([[40.0, 30, 25, 3, 2, 0.3, 5], [40.0, 2, 25, 3, 2, 0.3, 5], np.full(7, np.nan)])
+    y, x = np.mgrid[:60, :60]
+    noise = np.random.default_rng(0).normal(0, 2.0, (60, 60))
+    tracks = xr.Dataset(
+        {"fit_ref": (("column_id", "parameter"), reference)}, attrs={"window_px": 15, "reference_blur_px": 0.0}
+    )
+    summed = xr.Dataset({"image": (("y", "x"), evaluate(reference[0], x, y) + noise)})
+    disc = np.hypot(y - 25, x - 30) <= 7
+    expected = np.sqrt((noise[disc] ** 2).mean()) / 40
+    np.testing.assert_allclose(residuals(tracks, summed), [expected, np.nan, np.nan], rtol=1e-5)
+    outside, shown = residual_windows(tracks, summed, [1, 0])
+    assert np.isnan(outside).all()
+    np.testing.assert_allclose(shown[2][np.isfinite(shown[1])], noise[disc], atol=1e-4)

@@ -15,6 +15,7 @@ from distributed import Client
 from tract_dask.errors import SettingsError, SourceError
 from tract_dask.progress import ShardDone, StageDone, StageStarted, Warned
 from tract_dask.settings import DriftSettings
+from tract_dask.stages.drift.measure import _middle
 from tract_dask.stages.drift.stage import estimate_drift, read_drift_csv
 from tract_dask.stages.sum import _accumulator, sum_image
 from tract_dask.store.shards import split
@@ -394,3 +395,10 @@ def test_sums_of_integers_are_exact():
     assert _accumulator(MemoryMovie(np.zeros((1, 1, 1), np.int8)), 10) == np.int64
     pixels = np.full((300, 3, 3), 65535, np.uint16)
     assert (sum_image(MemoryMovie(pixels, 10))["image"] == 65535).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 50])
+def test_the_usual_score_is_the_median_of_all(count):
+    scores = np.random.default_rng(count).normal(size=count)
+    assert _middle(sorted(scores.tolist())) == np.median(scores)
+    assert np.isnan(_middle([]))

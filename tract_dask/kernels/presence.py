@@ -30,6 +30,9 @@ from .windows import gaussian_kernel
 
 Array = NDArray[Any]
 
+_BLOCK_PIXELS = 1 << 18
+"""Pixels of windows that filters are made for at a time: making them takes twenty times the memory that they keep."""
+
 
 class Filters(NamedTuple):
     """Weights of matched filters, one for each column, packed as vectors.
@@ -72,7 +75,20 @@ def matched_filters(parameters: NDArray[np.float64], size: int, blur_sigma_px: f
     """
     half, step = size // 2, max(1, int(1.5 * blur_sigma_px))
     rows, columns = np.arange(-(half // step) * step, half + 1, step), np.arange(size) - half
-    disc = np.hypot(rows[:, None], columns) <= size / 2
+    offset, place = _places(rows + half, size)
+    weights = np.empty((len(parameters), len(place), LANES), np.float32)
+    many = max(1, _BLOCK_PIXELS // size**2)
+    for k in range(0, len(parameters), many):
+        flat = _weights(parameters[k : k + many], rows, columns, blur_sigma_px)
+        weights[k : k + many] = _packed(flat, offset, place)
+    return Filters(weights, place, size)
+
+
+def _weights(
+    parameters: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64], blur_sigma_px: float
+) -> NDArray[np.float64]:
+    """Return the weights (n, rows, columns) at some rows of the windows, which are counted from the middle one."""
+    disc = np.hypot(rows[:, None], columns) <= len(columns) / 2
     narrow = blurred(parameters, -2 * blur_sigma_px**2)
     narrow[:, [AMPLITUDE, X, Y, BACKGROUND]] = np.sign(narrow[:, [AMPLITUDE]]) * [1, 0, 0, 0]
     shape = evaluate(narrow, columns, rows[:, None])
@@ -80,21 +96,24 @@ def matched_filters(parameters: NDArray[np.float64], size: int, blur_sigma_px: f
     across, down = (_spread(kernel_rows, blur_sigma_px) for kernel_rows in (columns, rows))
     norm = np.sqrt(((down @ weights @ across.T) ** 2).sum(axis=(1, 2)))
     weights /= np.maximum(norm, np.finfo(float).tiny)[:, None, None]
-    return _packed(weights, rows + half, size)
+    return weights
 
 
-def _packed(weights: NDArray[np.float64], rows: NDArray[np.int64], size: int) -> Filters:
-    """Return weights (n, rows, size) for some rows of windows as vectors, none of which reaches beyond a window."""
-    per_row = -(-size // LANES)
-    offset = (rows[:, None] * size + LANES * np.arange(per_row)).ravel()
-    place = np.minimum(offset, size * size - LANES)
-    target = np.arange(size) + LANES * per_row * np.arange(len(rows))[:, None]
-    flat = np.zeros((len(weights), len(rows) * per_row * LANES), np.float32)
-    flat[:, target.ravel()] = weights.reshape(len(weights), -1)
-    packed = flat.reshape(len(weights), -1, LANES)
+def _places(rows: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the vectors of some rows of a window begin, and the same for vectors that do not reach beyond it."""
+    offset = (rows[:, None] * size + LANES * np.arange(-(-size // LANES))).ravel()
+    return offset, np.minimum(offset, size * size - LANES)
+
+
+def _packed(weights: NDArray[np.float64], offset: NDArray[np.int64], place: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return weights (n, rows, size) as vectors (n, vectors, LANES) that begin at ``place``."""
+    n, rows, size = weights.shape
+    flat = np.zeros((n, rows, len(place) // rows * LANES), np.float32)
+    flat[:, :, :size] = weights
+    packed = flat.reshape(n, -1, LANES)
     for vector_, back in enumerate(offset - place):
         packed[:, vector_] = np.roll(packed[:, vector_], back, axis=1)
-    return Filters(packed, place, size)
+    return packed
 
 
 def _spread(places: NDArray[np.int64], sigma: float) -> NDArray[np.float64]:

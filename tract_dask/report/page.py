@@ -32,7 +32,7 @@ from ..web.bundle import STATIC
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import MASK_COLOURS, figure_data, mask_data, windows_data
-from .survey import Survey, events_of, median, percentiles, residuals, survey
+from .survey import Survey, events_of, median, percentiles, residual_windows, survey
 
 _SCRIPT = Path(__file__).parent / "page.js"
 KEY = '<meta name="tract-dask-key" content="'
@@ -259,10 +259,13 @@ def worst_columns(run: Survey) -> list[dict[str, Any]]:
 
 def _windows(run: Survey) -> list[dict[str, Any]]:
     """Return image, model and residual of the columns with the largest residuals."""
-    share, shown = residuals(run.tracks, run.summed)
+    share = run.columns["residual"].to_numpy()
     order = [k for k in np.argsort(-np.nan_to_num(share, nan=-1.0), kind="stable")[:_WORST] if np.isfinite(share[k])]
     ids = run.columns["column_id"].to_numpy()
-    return [{"id": int(ids[k]), "share": f"{share[k]:.1%}", "data": windows_data(shown[k])} for k in order]
+    return [
+        {"id": int(ids[k]), "share": f"{share[k]:.1%}", "data": windows_data(shown)}
+        for k, shown in zip(order, residual_windows(run.tracks, run.summed, order), strict=True)
+    ]
 
 
 def _pictures(run: Survey) -> Iterator[Picture]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,7 +121,7 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     others = strangers(folder)
     if places.drift.exists() and places.drift not in others:
         frames["quality"] = ("frame", datasets.open_dataset(places.drift)["quality"].to_numpy())
-    columns["residual"] = ("column_id", residuals(tracks, summed)[0])
+    columns["residual"] = ("column_id", residuals(tracks, summed))
     return Survey(
         folder=folder,
         tracks=measured,
@@ -198,15 +198,30 @@ def frame_curves(frames: xr.Dataset) -> dict[str, Floats]:
     return overview.frame_curves(known, -(-frames.sizes["frame"] // _FRAMES))
 
 
-def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[Floats, Floats]:
-    """Return what the fits on the summed image leave.
+def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> Floats:
+    """Return the rms residual of each column's fit on the summed image, as a share of its amplitude.
 
-    Returns
-    -------
-    tuple
-        The rms residual of each column in its round window as a share of its amplitude (column_id); and the windows
-        (column_id, 3, window, window): blurred image, model, and their difference, in counts a frame, NaN beyond the
-        disc. NaN where the column was not fitted in the summed image.
+    It is that of the pixels of the round window; NaN where a column was not fitted in the summed image.
+    """
+    amplitudes = np.abs(tracks["fit_ref"].to_numpy()[:, AMPLITUDE].astype(np.float64))
+    shown = residual_windows(tracks, summed, range(len(amplitudes)))
+    return np.array([_rms(window) for window in shown]) / amplitudes
+
+
+def _rms(window: Floats) -> float:
+    _, model, left = window
+    inside = left[np.isfinite(model)]
+    return float(np.sqrt(np.mean(inside**2))) if inside.size else np.nan
+
+
+def residual_windows(tracks: xr.Dataset, summed: xr.Dataset, which: Iterable[int]) -> Iterator[Floats]:
+    """Yield what the fits on the summed image leave of the columns at the places ``which``, one by one.
+
+    Yields
+    ------
+    numpy.ndarray
+        (3, window, window): blurred image, model, and their difference, in counts a frame, NaN beyond the disc, and
+        everywhere where the column was not fitted in the summed image.
     """
     window, sigma = int(tracks.attrs["window_px"]), float(tracks.attrs["reference_blur_px"])
     image = blur(summed["image"].to_numpy(), sigma)
@@ -215,18 +230,14 @@ def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> tuple[Floats, Floats]:
     half = window // 2
     rows, columns = np.mgrid[-half : half + 1, -half : half + 1]
     disc = rows**2 + columns**2 <= half**2
-    shown = np.full((len(parameters), 3, window, window), np.nan)
-    for k, own in enumerate(parameters):
-        if not np.isfinite(own).all():
-            continue
-        y, x = (round(own[Y]), round(own[X]))
+    for own in parameters[list(which)]:
+        y, x = (round(own[Y]), round(own[X])) if np.isfinite(own).all() else (-1, -1)
         if min(y, x) < half or y + half >= image.shape[0] or x + half >= image.shape[1]:
+            yield np.full((3, window, window), np.nan)
             continue
         data = image[y - half : y + half + 1, x - half : x + half + 1]
         model = evaluate(own, columns + x, rows + y)
-        shown[k] = np.where(disc, np.stack([data, model, data - model]), np.nan)
-    rms = np.sqrt(np.mean(shown[:, 2][:, disc] ** 2, axis=1)) / np.abs(parameters[:, AMPLITUDE])
-    return rms, shown
+        yield np.where(disc, np.stack([data, model, data - model]), np.nan)
 
 
 def _frames_a_bin(n_frames: int, n_columns: int, values: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -329,19 +330,27 @@ def _follow_shard(movie: Movie, level: Level, folder: Path, shard: Shard) -> Pay
     for k, (_, small) in enumerate(opening):
         if small is not None:
             scores[k] = follower.resemblance(small, shifts[k])
+    ranked = sorted(scores[~np.isnan(scores)].tolist())
     counted = np.ones((2, *level.shape), np.float32)
     for k, (image, small) in enumerate(chain(opening, pairs)):
         if image is None or small is None:
             continue
         if k >= len(opening):
-            shifts[k], scores[k] = guess, _ = follower.follow(small, guess)
-        trusted[k] = scores[k] >= _TRUST * np.nanmedian(scores[: max(k + 1, len(opening))])
+            shifts[k], scores[k] = guess, score = follower.follow(small, guess)
+            if not np.isnan(score):
+                insort(ranked, score)
+        trusted[k] = scores[k] >= _TRUST * _middle(ranked)
         if trusted[k]:
             counted[0] = image
             added.add(counted, _whole(shifts[k]))
     save_array(folder / f"{shard.index}.npy", added.total)
     placed = _whole(shifts) - added.origin
     return {"drift": shifts - added.origin, "placed": placed, "trusted": trusted}
+
+
+def _middle(ranked: Sequence[float]) -> float:
+    """Return the median of numbers in order; NaN if there are none."""
+    return (ranked[(len(ranked) - 1) // 2] + ranked[len(ranked) // 2]) / 2 if ranked else np.nan
 
 
 def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], folder: Path) -> tuple[Track, Whole]:
