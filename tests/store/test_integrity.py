@@ -530,7 +530,7 @@ def test_verify_reads_the_parts_of_a_fit_that_is_not_finished(copy):
     data[40] ^= 1
     part.write_bytes(data)
     (fault,) = (found := verify(store)).faults
-    assert (fault.file, fault.what, fault.frames) == (journal.path, "damaged", (0, step))  # a short part
+    assert (fault.file, fault.what, fault.frames) == (part, "damaged", (0, step))
     assert found.remedies == ["Run the same command again: it makes again what is damaged"]
 
 
