@@ -123,6 +123,22 @@ def test_it_can_be_switched_off(make, scene):
     np.testing.assert_array_equal(movie.read(0, 24), frames)
 
 
+def test_columns_without_a_reference_are_not_accepted_where_pixels_are_missing(make, scene):
+    frames = scene.counts().astype(np.float32)
+    frames[:, :, 116:] = np.nan
+    columns = scene.columns()
+    cut = scene.place[:, 0] > 100
+    columns["fit_ref"][cut] = np.nan
+    columns["x_ref"][cut] -= 6.0
+    movie, _ = make(frames)
+    settings = FitSettings(refine_drift=False)
+    tracks = fit_columns(movie, columns, scene.drift_dataset(), settings, summed=scene.summed()).compute()
+    status = tracks["status"].to_numpy()
+    assert ((status[:, cut] & Status.INCOMPLETE) > 0).mean() > 0.2
+    assert not ((status & REJECTED) == 0)[:, cut][(status[:, cut] & Status.INCOMPLETE) > 0].any()
+    assert ((status & REJECTED) == 0)[:, ~cut].mean() > 0.27
+
+
 def test_columns_are_found_without_the_hot_pixels(make, scene):
     frames, _ = spoiled(scene, "hot")
     movie, _ = make(frames)

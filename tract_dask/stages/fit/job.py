@@ -119,6 +119,12 @@ class Job:
         )
 
     @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """(columns,) whether the column could be fitted on the summed image."""
+        known: NDArray[np.bool_] = np.isfinite(self.columns["fit_ref"].to_numpy()).all(axis=1)
+        return known
+
+    @cached_property
     def reference(self) -> Floats:
         """(columns, 7) fit on the summed image, as it would be after the blur of the windows, in :attr:`unit`.
 
@@ -127,7 +133,7 @@ class Job:
         What could not be fitted there holds the median shape at the seed's place.
         """
         reference: Floats = self.columns["fit_ref"].to_numpy().astype(np.float64)
-        known = np.isfinite(reference).all(axis=1)
+        known = self.known
         if not known.any():
             raise SettingsError(
                 "no column could be fitted in the summed image",

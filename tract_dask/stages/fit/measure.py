@@ -237,6 +237,7 @@ def _fit_again(
         return _fit_windows(windows, [values[which[numbers]] for values in bounds], column[numbers], job)
 
     found, missing, lost = fit_incomplete(raw, job.settings, fit)
+    lost |= missing & ~job.known[column]  # neither the place nor the shape of such a column was ever seen whole
     for name, values in vars(found).items():
         vars(fits)[name][which] = values
     fits.incomplete[which] = missing
