@@ -129,7 +129,7 @@ def test_columns_without_a_reference_are_not_accepted_where_pixels_are_missing(m
     columns = scene.columns()
     cut = scene.place[:, 0] > 100
     columns["fit_ref"][cut] = np.nan
-    columns["x_ref"][cut] -= 6.0
+    columns["x_ref"][cut], columns["y_ref"][cut] = scene.place[cut, 0] - 6.0, scene.place[cut, 1]
     movie, _ = make(frames)
     settings = FitSettings(refine_drift=False)
     tracks = fit_columns(movie, columns, scene.drift_dataset(), settings, summed=scene.summed()).compute()
