@@ -192,7 +192,7 @@ def test_lazy_frames(tmp_path, source, counts):
     frames = movie.frames
     assert frames.dims == ("t", "y", "x")
     assert frames.chunks == ((3,) * 7, (150,), (131,))
-    assert frames.attrs == {"pixel_size_pm": 8.0, "frame_time_s": 0.5, "dose": 125.0, "gain": 0.5}
+    assert frames.attrs == {"pixel_size_pm": 8.0, "frame_time_s": 0.5, "dose": 125.0, "gain": 0.5, "offset": 0.0}
     np.testing.assert_array_equal(frames.t, np.arange(21) * 0.5)
     np.testing.assert_array_equal(frames.x, np.arange(131) * 8.0)
     part = frames[4:9, 10:20, ::3]
