@@ -321,7 +321,7 @@ def test_inspect_counts_pixels_without_data(npy, scene, tmp_path, inline):
 
 def test_frames_that_cannot_be_fitted_end_with_3(npy, scene, tmp_path, inline):
     frames = scene.counts().astype(np.float32)
-    frames[3, 80, 70] = np.inf
+    frames[3, 20:] = np.inf  # most of it
     result = tract("run", npy(frames), tmp_path / "out")
     assert result.exit_code == 3, result.output
     assert "could not be fitted" in result.stderr
