@@ -288,7 +288,7 @@ def test_a_movie_that_was_replaced_since_its_job_was_submitted_is_refused(api, r
     state.store.change(job["id"], State.RUNNING)
     order = JobProcess(state.store.job(job["id"]), state.store, state.root, None, None, lambda: None)._order()
     cluster = to_dict(RunSettings())["cluster"]
-    with pytest.raises(ChangedSourceError, match="not what it was when the job was submitted"):
+    with pytest.raises(ChangedSourceError, match="changed since the job was submitted"):
         run_order(order | {"cluster": cluster}, Reporter(io.StringIO(), {}))
     assert not (root / job["output"] / "movie.zarr").exists()
 

@@ -127,7 +127,7 @@ def _mixed(run: Survey) -> Iterator[Finding]:
         yield Finding(
             "mixed",
             "Stores of two runs",
-            f"{' and '.join(others)}: made from another movie than movie.zarr, which lies beside.",
+            f"{' and '.join(others)}: made from another movie than movie.zarr, which lies next to them.",
             f"{advice(run.folder)}.",
         )
 

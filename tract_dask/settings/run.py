@@ -79,9 +79,7 @@ class ConvertSettings(Settings):
     )
     tile_px: int = setting(256, "Side of the tiles inside a shard", unit="px", low=16, high=8192)
     codec: str = setting("lz4", "Lossless compression: lz4 is fast, zstd is smaller", choices=("lz4", "zstd", "none"))
-    find_defects: bool = setting(
-        True, "Find hot and dead pixels, spikes, dead lines and borders, and leave them out", common=True
-    )
+    find_defects: bool = setting(True, "Find hot and dead pixels, spikes, dead lines and borders, and leave them out")
 
 
 @dataclass(frozen=True)
@@ -141,9 +139,7 @@ class ColumnSettings(Settings):
     centroid_radius_px: float | None = setting(
         None, "Radius of the centroid around that maximum; unset: an eighth of the spacing", unit="px", low=1
     )
-    min_amplitude: float = setting(
-        0.15, "Weakest column that is kept, against the median amplitude", low=0, high=1, common=True
-    )
+    min_amplitude: float = setting(0.15, "Weakest column that is kept, against the median amplitude", low=0, high=1)
     detection_threshold: float = setting(
         5.0, "Methods maxima, blobs, template: weakest column, in units of the peaks of noise alone", low=0, high=1e4
     )

@@ -16,7 +16,7 @@ from .run_folder import RunFolder
 MOVIE_KEY = "movie_key"
 """Attribute of drift, sum, columns and results: the key of the movie that they were made from."""
 
-WHY = "it was made from another movie than movie.zarr, which lies beside it"
+WHY = "it was made from another movie than movie.zarr, which lies next to it"
 
 
 def strangers(folder: Path) -> tuple[Path, ...]:

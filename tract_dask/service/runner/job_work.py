@@ -160,7 +160,7 @@ def check_content(
     with closing(open_input(source, settings, outputs.movie, permit)) as opened:
         if origin_of(opened).content != content:
             raise ChangedSourceError(
-                "the movie is not what it was when the job was submitted",
+                "the movie has changed since the job was submitted",
                 str(source),
                 "what it held then",
                 "something else: it was replaced, or written again",
