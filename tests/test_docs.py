@@ -187,8 +187,11 @@ def test_the_tutorial_runs_makes_its_figures_and_finds_the_truth(tmp_path):
     said = call(sys.executable, str(ROOT / "scripts" / "make_notebook"), "--figures", str(tmp_path), folder=tmp_path)
     shown = re.findall(r"\(images/tutorial/(.*?)\)", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"))
     assert sorted(shown) == sorted(file.name for file in tmp_path.glob("*.png"))
-    absent = re.search(r"^absent: (.*)$", said, re.MULTILINE)[1]
-    assert re.search(r"^not accepted: (.*)$", said, re.MULTILINE)[1] == absent
+    absent, rejected = (
+        set(re.search(rf"^{name}: \[(.*)\]$", said, re.MULTILINE)[1].split()) for name in ("absent", "not accepted")
+    )
+    assert absent <= rejected
+    assert len(rejected - absent) <= 1  # of 31 frames in which the faint column is there
     jumping, frames = re.search(r"^column (\d+) jumps at frames \[(.*)\]$", said, re.MULTILINE).groups()
     assert f"the Wiener filter moved column {jumping}" in said
     found = re.findall(rf"^\d+ +{jumping} +(\d+) ", said.partition("p_value\njump")[2], re.MULTILINE)
