@@ -1,8 +1,11 @@
 """Runs on a real SLURM of one node, whose jobs are cancelled under them."""
 
 import dataclasses
+import signal
 import subprocess
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import dask
 import numpy as np
@@ -106,6 +109,18 @@ def test_jobs_come_with_clients_and_go_after_them(settings, monkeypatch):
             # asked of SLURM: the worker's memory and 256 MB for the process that watches it
             assert jobs("%P_%m_%l_%k") == ["test_1198M_10:00_test"]
         wait_for(lambda: jobs() == [])
+
+
+def test_ctrl_c_is_answered_as_before(settings, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "dask_jobqueue"]:
+        monkeypatch.delitem(sys.modules, name)
+    wrong = dataclasses.replace(settings, slurm=SlurmSettings(queue="nowhere"))
+    with ThreadPoolExecutor(1) as threads, pytest.raises(ClusterError, match="in the main thread"):
+        threads.submit(cluster.connect(wrong).__enter__).result()
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(ClusterError, match="invalid partition"), cluster.connect(wrong):
+        pass
+    assert signal.getsignal(signal.SIGINT) == before
 
 
 def test_what_slurm_refuses_is_told(settings):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from math import ceil
-from threading import Event, Thread
+from threading import Event, Thread, current_thread, main_thread
 from time import monotonic
 from typing import Any
 
@@ -48,7 +50,7 @@ def hold_slurm(settings: ClusterSettings, memory_limit: int | None) -> Iterator[
         Where dask-jobqueue is missing or SLURM does not answer.
     """
     try:
-        from dask_jobqueue import SLURMCluster
+        jobqueue = _import_jobqueue()
     except ImportError as error:
         raise ClusterError(
             "dask-jobqueue is not installed",
@@ -57,7 +59,7 @@ def hold_slurm(settings: ClusterSettings, memory_limit: int | None) -> Iterator[
             str(error),
             'Install it with: pip install "tract_dask[slurm]"',
         ) from error
-    with SLURMCluster(**_arguments(settings, int(memory_limit or 0))) as cluster:
+    with jobqueue.SLURMCluster(**_arguments(settings, int(memory_limit or 0))) as cluster:
         _ask(["sbatch", "--test-only"], cluster.job_script())
         ended = Event()
         keeping = Thread(target=_keep, args=(cluster, settings, ended), name="slurm", daemon=True)
@@ -67,6 +69,24 @@ def hold_slurm(settings: ClusterSettings, memory_limit: int | None) -> Iterator[
         finally:
             ended.set()
             keeping.join()
+
+
+def _import_jobqueue() -> Any:
+    """Return dask-jobqueue; its import answers Ctrl-C by an exit with code 0, so this process's answer is put back."""
+    if "dask_jobqueue" not in sys.modules and current_thread() is not main_thread():
+        raise ClusterError(
+            "dask-jobqueue can only be imported in the main thread",
+            "setting kind (ClusterSettings)",
+            "the main thread",
+            f"the thread {current_thread().name}",
+            "Write 'import dask_jobqueue' at the top of the program that starts this thread.",
+        )
+    before = signal.getsignal(signal.SIGINT)
+    import dask_jobqueue
+
+    if current_thread() is main_thread():
+        signal.signal(signal.SIGINT, before)
+    return dask_jobqueue
 
 
 def _arguments(settings: ClusterSettings, memory_limit: int) -> dict[str, Any]:
