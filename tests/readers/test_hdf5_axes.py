@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import zarr
 from files_hdf5 import FRAMES, emd, hyperspy, nexus, velox
 
 from tract_dask.errors import SourceError
@@ -319,6 +321,82 @@ def test_values_that_are_to_be_scaled_are_noted(tmp_path: Path) -> None:
         file["data"] = FRAMES
         file["data"].attrs["scale_factor"] = 0.1
     assert "multiplied by 0.1 and 0 added" in open_source(tmp_path / "a.h5").metadata.notes[0]
+
+
+def stated(path: Path, movie: np.ndarray[Any, Any], **attributes: Any) -> Path:
+    """An array with attributes, in HDF5 or Zarr by the suffix."""
+    if path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file["data"] = movie
+            file["data"].attrs.update(attributes)
+    else:
+        array = zarr.create_array(str(path), shape=movie.shape, dtype=movie.dtype, chunks=(1, *movie.shape[1:]))
+        array[:] = movie
+        array.attrs.update(attributes)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".zarr"])
+@pytest.mark.parametrize("said", ["true", "True", "1"])
+def test_numbers_that_lost_their_sign_are_read_without_one(said: str, suffix: str, tmp_path: Path) -> None:
+    bright = FRAMES + 40_000
+    path = stated(tmp_path / f"a{suffix}", bright.view("i2"), _Unsigned=said, _FillValue=-1)
+    source = open_source(path)
+    same(source, bright)
+    assert source.dtype == "u2"
+    assert "without a sign" in source.metadata.notes[0]
+    assert (
+        "pixels of 65535 are meant to carry no data (_FillValue); they are read as that number"
+        in (source.metadata.notes[1])
+    )
+    small = np.full((2, 40, 36), 200, "u1")
+    (note,) = open_source(stated(tmp_path / f"b{suffix}", small, _Unsigned="false")).metadata.notes
+    assert "with a sign" in note
+    assert open_source(tmp_path / f"b{suffix}").read(0, 2).min() == -56
+    (note,) = open_source(stated(tmp_path / f"c{suffix}", small, _Unsigned="perhaps")).metadata.notes
+    assert "_Unsigned cannot be understood" in note
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".zarr"])
+@pytest.mark.parametrize("name", ["_FillValue", "missing_value"])
+def test_pixels_that_carry_no_data_are_missing(name: str, suffix: str, tmp_path: Path) -> None:
+    movie = FRAMES.astype("f4")
+    movie[1, 3, 4:6] = 9.96921e36
+    missing = np.where(movie > 1e30, np.nan, movie)
+    fill = float(np.float32(9.96921e36))
+    source = open_source(stated(tmp_path / f"a{suffix}", movie, **{name: fill}))
+    np.testing.assert_array_equal(source.read(0, 5), missing)
+    np.testing.assert_array_equal(source.read(1, 2), missing[1:2])
+    assert "they are read as missing" in source.metadata.notes[0]
+    assert open_source(stated(tmp_path / f"b{suffix}", movie, **{name: float("nan")})).metadata.notes == ()
+    as_text = base64.b64encode(np.array(fill, "<f8").tobytes()).decode()  # as xarray writes it to Zarr stores
+    np.testing.assert_array_equal(
+        open_source(stated(tmp_path / f"c{suffix}", movie, **{name: as_text})).read(0, 5), missing
+    )
+
+
+@pytest.mark.parametrize(
+    ("attributes", "words"),
+    [
+        ({"valid_min": 1.0}, "only numbers from 1 are meant"),
+        ({"valid_range": [0, 900]}, "from 0 and up to 900"),
+        ({"_FillValue": 0}, "pixels of 0 are meant to carry no data"),
+        ({"_FillValue": 70_000}, ""),
+        ({"_FillValue": "none"}, ""),
+        ({"valid_range": [1, 2, 3]}, ""),
+        ({"_Unsigned": "true"}, ""),
+        ({"dt": 0.05}, "its attribute dt cannot be understood"),
+        ({"scale": 0.02}, "its attribute scale cannot be understood"),
+        ({"scale_factor": 1.0, "dtype": 3, "scaled": 2}, ""),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".h5", ".zarr"])
+def test_what_attributes_say_of_numbers_is_noted(
+    attributes: dict[str, Any], words: str, suffix: str, tmp_path: Path
+) -> None:
+    source = open_source(stated(tmp_path / f"a{suffix}", FRAMES, **attributes))
+    same(source)
+    assert words in " ".join(source.metadata.notes) if words else source.metadata.notes == ()
 
 
 def test_pixels_of_a_virtual_data_set_that_come_from_nowhere(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from tract_dask.errors import MissingStoreError, SettingsError
 from tract_dask.service.auth.tokens import Identity, identity
 from tract_dask.service.jobs.states import State
 from tract_dask.service.views import column_editing
-from tract_dask.service.views.column_editing import edited_columns, lattice_sites, refine
+from tract_dask.service.views.column_editing import MOST_COLUMNS, edited_columns, lattice_sites, refine
 from tract_dask.settings import ColumnSettings, RunSettings, to_dict
 from tract_dask.stages.columns.find import find_columns
 from tract_dask.stages.columns.sites import lattice_columns
@@ -255,6 +256,30 @@ def test_a_few_columns_are_refined_as_all_are(scene: column_editing.Scene) -> No
     for place, whole in zip(TRUTH, every["columns"], strict=True):
         (alone,) = refine(scene, edited_columns([place + 2.5], [""], [1], SHAPE), every["spacing_px"])["columns"]
         assert (alone["x"], alone["y"]) == pytest.approx((whole["x"], whole["y"]), abs=2e-3)
+
+
+def test_columns_that_fall_together_in_great_numbers_take_no_time(scene: column_editing.Scene) -> None:
+    """600 seeds of as many kinds within 7 px: nearly every one meets every other one."""
+    seeds = np.repeat(TRUTH[:1] + np.indices((7, 7)).reshape(2, -1).T - 3, 16, axis=0)[:600]
+    kinds = [f"kind {k}" for k in range(len(seeds))]
+    began = time.monotonic()
+    found = refine(scene, edited_columns(seeds, kinds, [None] * len(seeds), SHAPE), 15.0)
+    assert time.monotonic() - began < 5
+    assert len(found["columns"]) < 20
+    assert len(found["columns"]) + len(found["merged"]) == len(seeds)
+
+
+def test_more_columns_on_a_pixel_than_can_be_meant_are_refused_at_once() -> None:
+    began = time.monotonic()
+    with pytest.raises(SettingsError, match=r"many columns have the same place.*200000 on the pixel at x 30, y 60"):
+        edited_columns(np.full((MOST_COLUMNS, 2), (30.2, 59.9)), [""] * MOST_COLUMNS, [None] * MOST_COLUMNS, SHAPE)
+    assert time.monotonic() - began < 4
+
+
+def test_too_many_large_windows_are_refused_at_once(scene: column_editing.Scene) -> None:
+    y, x = np.indices(SHAPE).reshape(2, -1)[:, ::7]
+    with pytest.raises(SettingsError, match="windows of 51 px"):
+        refine(scene, edited_columns(np.stack([x, y], 1), [""] * len(x), [None] * len(x), SHAPE), 100.0)
 
 
 def test_what_leaves_the_image_is_told(scene: column_editing.Scene) -> None:

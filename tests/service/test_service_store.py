@@ -1,5 +1,6 @@
 """The store of jobs: what it allows, what it keeps, who comes next, and that nothing that happens to it loses a job."""
 
+import errno
 import hashlib
 import itertools
 import json
@@ -569,6 +570,36 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(full, monkeypatch, 
     assert remedy in caught.value.remedy
 
 
-def test_an_empty_file_is_a_new_store(tmp_path):
-    (tmp_path / "service.sqlite").touch()
-    assert JobStore(tmp_path / "service.sqlite").jobs() == []
+@pytest.mark.parametrize("held", [False, True])
+def test_an_emptied_file_is_no_new_store(full, held):
+    """Jobs and tokens are lost, so it is not begun anew in silence; nor waited for while another connection is open."""
+    other = JobStore(full).connection() if held else None
+    full.write_bytes(b"")
+    for end in ("-wal", "-shm"):
+        full.with_name(full.name + end).unlink(missing_ok=True)
+    began = time.monotonic()
+    with pytest.raises(StoreError, match="the job store is empty") as caught:
+        JobStore(full)
+    assert time.monotonic() - began < 1
+    assert "begin without jobs and tokens" in caught.value.remedy
+    assert other is None or other.execute("SELECT 1").fetchone()
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_new_store_is_there_whole_or_not_at_all(tmp_path, monkeypatch, links):
+    """What is killed while it makes a store leaves no file that the next one could not use."""
+    path = tmp_path / "service.sqlite"
+    if not links:
+
+        def refused(*_):
+            raise PermissionError(errno.EPERM, "no links here")
+
+        monkeypatch.setattr(tables.os, "link", refused)
+    seen, whole = [], tables.migrate
+    monkeypatch.setattr(tables, "migrate", lambda db, place: (whole(db, place), seen.append(path.exists())))
+    tables.create(path)
+    assert seen == [False]
+    assert [found.name for found in tmp_path.iterdir()] == [path.name]
+    kept = JobStore(path).submit(source="movie.tif", settings={}, owner="maria")
+    tables.create(path) if links else None  # another process was as fast
+    assert JobStore(path).job(kept.id) == kept

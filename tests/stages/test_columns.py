@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from tract_dask.kernels.gaussian.parameters import PARAMETERS
 from tract_dask.settings import ColumnSettings, from_toml, to_toml
 from tract_dask.stages.columns.find import find_columns
 from tract_dask.stages.columns.sites import lattice_columns
+from tract_dask.stages.columns.twins import twins_of
+from tract_dask.stages.columns.window_size import neighbour_distance
 from tract_dask.store.columns import column_dataset, columns_csv, positions, read_columns_csv
 from tract_dask.store.schema import COLUMNS, Status, validate
 
@@ -253,6 +256,30 @@ def test_seeds_keep_their_ids_and_the_later_of_two_is_dropped() -> None:
     assert columns.attrs["merged"] == [[9, 12]]
     assert (columns.kind == "Ce").all()
     assert furthest(columns, truth) < NOISE_FREE_BUDGET_PX
+
+
+def test_the_first_of_places_that_fall_together_stays() -> None:
+    """As all pairs say, which 100,000 places on one spot could not be asked for."""
+    rng = np.random.default_rng(3)
+    places = np.vstack([rng.uniform(0, 60, (150, 2)), rng.normal(30, 1, (100, 2)), np.full((20, 2), 7.5)])
+    places = places[rng.permutation(len(places))]
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    for distance in (1e-9, 0.7, 4.0, 100.0):
+        expected: dict[int, int] = {}
+        for place in range(len(places)):
+            kept = [first for first in range(place) if first not in expected and apart[first, place] <= distance]
+            if kept:
+                expected[place] = kept[0]
+        assert twins_of(places, distance) == expected
+    began = time.monotonic()
+    assert len(twins_of(np.full((100_000, 2), 12.25), 3.0)) == 99_999
+    assert neighbour_distance(np.full((100_000, 2), 12.25)) is None
+    assert time.monotonic() - began < 5
+
+
+def test_places_on_one_spot_have_no_distance() -> None:
+    assert neighbour_distance(np.array([[1.0, 2.0], [1.0, 2.0], [4.0, 6.0]])) is None  # more than half are at 0
+    assert neighbour_distance(np.array([[1.0, 2.0], [1.0, 2.0], [4.0, 6.0], [4.0, 7.0], [4.0, 9.0]])) == 1.0
 
 
 def test_dropping_a_seed_leaves_the_others_ids() -> None:

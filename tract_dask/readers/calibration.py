@@ -73,8 +73,8 @@ DECLARED = ("pixel_size_", "frame_time_")
 """Beginnings of attributes that programs give to arrays, with the unit behind."""
 
 
-_LENGTH = re.compile(r"(pixel|voxel)_?(size|spacing|width|scale)", re.IGNORECASE)
-_TIME = re.compile(r"frame_?(rate|time|interval|period)|fps|exposure", re.IGNORECASE)
+_LENGTH = re.compile(r"(pixel|voxel)_?(size|spacing|width|scale)|(scale|spacing|sampling|dx|dy)$", re.IGNORECASE)
+_TIME = re.compile(r"frame_?(rate|time|interval|period)|fps|exposure|(time_?step|delta_?t|dt)$", re.IGNORECASE)
 """Names of attributes that may be meant for a calibration."""
 
 
@@ -143,16 +143,5 @@ def as_number(value: Any) -> float:
         return number(value.decode("latin-1") if isinstance(value, bytes) else value)
     try:
         return float(np.asarray(value).item())
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return math.nan
-
-
-def packing(scale: float, offset: float, where: str) -> tuple[str, ...]:
-    """Return a note where netCDF says that values are to be scaled: they are read as they are stored."""
-    factor, added = 1.0 if math.isnan(scale) else scale, 0.0 if math.isnan(offset) else offset
-    if (factor, added) == (1.0, 0.0):
-        return ()
-    return (
-        f"{where}: its values are meant to be multiplied by {factor:g} and {added:g} added (scale_factor, add_offset);"
-        " they are read as they are stored",
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,10 @@ from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..axes import Axis, Order, ordered, spelled_out
 from ..blocks import fill_from
-from ..calibration import as_number, calibrated, may_calibrate, packing, with_declared
+from ..calibration import calibrated, may_calibrate, with_declared
 from ..checks import DAMAGE, MOST_FRAMES, Frames, Permit, checked_dtype, checked_file, open_binary, reading, widened
 from ..joined import JoinedSource, check_alike
+from ..meant import STATED, as_meant
 from ..source import Source, SourceMetadata
 from .axes import axes_of, single, text
 from .bitshuffle import FILTER, BitshuffledSource, chunks_of, codec_of
@@ -153,37 +154,42 @@ def _one(file: Any, path: Path, shown: str, notes: tuple[str, ...], access: Acce
     with ExitStack() as stack:
         dataset = follow(file, shown, access, stack)
         where = f"{path}::{shown}"
-        dtype = _pixels_of(dataset, where)
-        codec = codec_of(dataset)
-        _check_filters(dataset, where, spared=codec is not None)
-        behind = files_behind(dataset, access)
-        files = tuple(access.files)
-        axes, unread = axes_of(dataset, where, file)
-        axes = spelled_out(axes)
-        order = ordered(axes, dataset.shape or (), where)
-        shape = order.shape(dataset.shape)
-        raw_bytes = sum(part.n_bytes for part in behind.raw)
-        notes += (*unread, *check_storage(dataset, where, files, raw_bytes), *behind.notes, *_doubts(dataset, order))
-        metadata = _calibration(file, dataset, axes, order, where)
-        common: dict[str, Any] = {
-            "path": str(path),
-            "files": files,
-            "format": "Velox EMD" if is_velox(dataset) else "HDF5",
-            "shape": shape,
-            "dtype": dtype,
-            "metadata": replace(metadata, notes=metadata.notes + notes),
-            "inside": dataset.name,
-        }
-        if dataset.id.get_create_plist().get_external_count():
-            _check_plain_order(order, where)
-            return RawPixelSource(**common, segments=tuple(behind.raw), stored=_stored(dataset, where))
-        common |= {"holder": Path(dataset.file.filename), "order": order}
-        if codec is not None:
-            found = chunks_of(dataset, where)
-            fill = dataset.fillvalue
-            return BitshuffledSource(**common, stored=dataset.dtype, chunks=found, codec=codec, fill=fill)
-        depth = dataset.chunks[order.frame] if order.frame and dataset.chunks else 1
-        return Hdf5Source(**common, inner=dataset.name, sources=_sources(behind, order), depth=depth)
+        return as_meant(_as_stored(file, dataset, path, where, notes, access), _stated(dataset), where)
+
+
+def _as_stored(file: Any, dataset: Any, path: Path, where: str, notes: tuple[str, ...], access: Access) -> Source:
+    """Open a data set, with its numbers as they are stored."""
+    dtype = _pixels_of(dataset, where)
+    codec = codec_of(dataset)
+    _check_filters(dataset, where, spared=codec is not None)
+    behind = files_behind(dataset, access)
+    files = tuple(access.files)
+    axes, unread = axes_of(dataset, where, file)
+    axes = spelled_out(axes)
+    order = ordered(axes, dataset.shape or (), where)
+    shape = order.shape(dataset.shape)
+    raw_bytes = sum(part.n_bytes for part in behind.raw)
+    notes += (*unread, *check_storage(dataset, where, files, raw_bytes), *behind.notes, *_doubts(dataset, order))
+    metadata = _calibration(file, dataset, axes, order, where)
+    common: dict[str, Any] = {
+        "path": str(path),
+        "files": files,
+        "format": "Velox EMD" if is_velox(dataset) else "HDF5",
+        "shape": shape,
+        "dtype": dtype,
+        "metadata": replace(metadata, notes=metadata.notes + notes),
+        "inside": dataset.name,
+    }
+    if dataset.id.get_create_plist().get_external_count():
+        _check_plain_order(order, where)
+        return RawPixelSource(**common, segments=tuple(behind.raw), stored=_stored(dataset, where))
+    common |= {"holder": Path(dataset.file.filename), "order": order}
+    if codec is not None:
+        found = chunks_of(dataset, where)
+        fill = dataset.fillvalue
+        return BitshuffledSource(**common, stored=dataset.dtype, chunks=found, codec=codec, fill=fill)
+    depth = dataset.chunks[order.frame] if order.frame and dataset.chunks else 1
+    return Hdf5Source(**common, inner=dataset.name, sources=_sources(behind, order), depth=depth)
 
 
 def _doubts(dataset: Any, order: Order) -> tuple[str, ...]:
@@ -281,6 +287,12 @@ def _metadata(file: Any, dataset: Any, axes: list[Axis], order: Order, where: st
     said = velox_metadata(dataset, where) if is_velox(dataset) else calibrated(axes, order, where)
     holders = dict.fromkeys((file["/"], dataset.file["/"], dataset.parent, dataset))
     attributes = [{name: single(item, name) for name in item.attrs if may_calibrate(name)} for item in holders]
-    said = with_declared(said, attributes, Path(where.partition("::")[0]).name)
-    scaled = packing(as_number(single(dataset, "scale_factor")), as_number(single(dataset, "add_offset")), where)
-    return replace(said, notes=said.notes + scaled)
+    return with_declared(said, attributes, Path(where.partition("::")[0]).name)
+
+
+def _stated(dataset: Any) -> dict[str, Any]:
+    """Return what the attributes of a data set say of its numbers; nothing where they are damaged."""
+    with suppress(*DAMAGE):
+        there = [name for name in STATED if name in dataset.attrs]
+        return {name: dataset.attrs[name] for name in there if dataset.attrs.get_id(name).shape in ((), (1,), (2,))}
+    return {}

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ...errors import SourceError
 from ...settings.run import SourceSettings
 from ..axes import Order, ordered, spelled_out
-from ..calibration import as_number, calibrated, may_calibrate, packing, with_declared
+from ..calibration import as_number, calibrated, may_calibrate, with_declared
 from ..checks import Frames, Permit, checked_claim, checked_dtype, checked_file, reading, truncated, widened
 from ..hdf5.candidates import ambiguous, movies_of, others_of
+from ..meant import STATED, as_meant
 from ..source import FrameValues, Part, Source, SourceMetadata
 from .blosc import check_blosc
 from .nodes import Node, arrays_below, axes_of, node_at, open_node
@@ -104,7 +105,7 @@ def open_zarr(path: Path, inner: str, settings: SourceSettings, permit: Permit |
         missing = _missing(node, len(names), array.fill_value, where)
         if not missing and node.index is not None and chunks:
             missing = _missing_inside(node, dict(zip(names, chunks, strict=True)), array.fill_value, where)
-        return ZarrSource(
+        stored = ZarrSource(
             path=str(path),
             files=(*place.used, *chunks),
             format=convention,
@@ -118,6 +119,7 @@ def open_zarr(path: Path, inner: str, settings: SourceSettings, permit: Permit |
             n_metadata=len(place.used),
             firsts=firsts if chunks else firsts[:0],
         )
+        return as_meant(stored, {name: node.attributes[name] for name in STATED if name in node.attributes}, path.name)
 
 
 def _chosen(place: Place, inner: str, path: Path) -> tuple[Node, tuple[str, ...]]:
@@ -210,8 +212,6 @@ def _ours(place: Place, node: Node, said: SourceMetadata, path: Path) -> SourceM
     holders = [{} if one is None else one.attributes for one in (above, node)]
     attributes = [{name: value for name, value in one.items() if may_calibrate(name)} for one in holders]
     said = with_declared(said, attributes, path.name)
-    factor, offset = (as_number(node.attributes.get(name, math.nan)) for name in ("scale_factor", "add_offset"))
-    said = replace(said, notes=said.notes + packing(factor, offset, path.name))
     store = (above.attributes if above else {}).get("tract_dask")
     if not isinstance(store, dict) or store.get("kind") != "movie":
         return said

@@ -18,7 +18,7 @@ from typing import Any
 from . import rows
 from .records import ConflictError, Deletion, Job, JobEvent, UnknownJobError, UnknownVersionError, utc_now
 from .states import CURATABLE, RETRYABLE, State
-from .tables import JobStoreError, check_place, migrate, store_error
+from .tables import JobStoreError, check_place, create, migrate, store_error
 
 __all__ = ["ConflictError", "Job", "JobEvent", "JobStore", "JobStoreError", "UnknownJobError", "UnknownVersionError"]
 
@@ -45,6 +45,8 @@ class JobStore:
         self._local = threading.local()
         check_place(path)
         try:
+            if not path.exists():
+                create(path)
             migrate(self.connection(), path)
         except sqlite3.Error as error:
             raise store_error(path, error) from error

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from contextlib import closing
+import threading
+from contextlib import closing, suppress
 from pathlib import Path
 
 from ...errors import StoreError
@@ -136,7 +137,7 @@ def check_place(path: Path) -> None:
     Raises
     ------
     JobStoreError
-        Where a folder, a pipe or a device is there, or only the log of a database that is gone.
+        Where a folder, a pipe, a device or an empty file is there, or only the log of a database that is gone.
     """
     log = path.with_name(f"{path.name}-wal")
     if path.exists() and not path.is_file():
@@ -151,6 +152,32 @@ def check_place(path: Path) -> None:
             "none",
             f"Restore it from a backup; or move {log.name} aside, to begin without jobs and tokens",
         )
+    if path.exists() and not path.stat().st_size:
+        raise JobStoreError("the job store is empty", str(path), "a database", "0 bytes", _BEGIN_ANEW)
+
+
+def create(path: Path) -> None:
+    """Make a store where none is, whole: other processes see none, or all of it.
+
+    Raises
+    ------
+    sqlite3.Error, OSError
+        Where it cannot be written.
+    """
+    aside = disk.aside(path, f"{os.getpid()}-{threading.get_native_id()}")
+    aside.unlink(missing_ok=True)
+    try:
+        with closing(sqlite3.connect(aside, isolation_level=None)) as made:
+            migrate(made, aside)
+        disk.sync(aside)
+        try:
+            with suppress(FileExistsError):  # another process has just made it
+                os.link(aside, path)
+        except OSError:  # a disk without links
+            aside.replace(path)
+        disk.sync(path.parent)
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def store_error(path: Path, error: sqlite3.Error) -> JobStoreError:

@@ -41,6 +41,11 @@ _SAME = 1 / 3
 """Sites nearer to a column than this share of the spacing are that column."""
 _FEW = 64
 """So many columns are refined on a part of the image."""
+_MOST_ON_A_PIXEL = 16
+"""Columns that may have their places on one pixel."""
+_MOST_WINDOW_PX = 10**8
+_MOST_COVER = 16
+"""Windows that are refined at once cover the image so many times at most, and have so many pixels together."""
 _AROUND = 3.0
 """How far that part reaches beyond the columns, in spacings."""
 
@@ -229,7 +234,7 @@ def edited_columns(
     ------
     SettingsError
         Where there is none or more than :data:`MOST_COLUMNS`, a place is not finite or outside the image, a number
-        comes twice or is none, or a kind is too long or cannot be written in a table.
+        comes twice or is none, a kind is too long or cannot be written in a table, or far too many are on one pixel.
     """
     xy = np.asarray(places, dtype=np.float64).reshape(-1, 2)
     if not 1 <= len(xy) <= MOST_COLUMNS:
@@ -249,7 +254,23 @@ def edited_columns(
             raise SettingsError("a kind cannot be used", f"{where}, column {number}", expected, repr(kind[:80]))
     columns = column_dataset(xy, kinds, _numbered(column_ids, next_id, where))
     check_inside(columns, shape, where)
+    _check_apart(xy, where)
     return columns
+
+
+def _check_apart(xy: NDArray[np.float64], where: str) -> None:
+    """Check that no pixel has more columns than can be meant."""
+    pixels, first, number = np.unique(np.rint(xy), axis=0, return_index=True, return_counts=True)
+    most = int(number.argmax())
+    if number[most] > _MOST_ON_A_PIXEL:
+        x, y = pixels[most]
+        raise SettingsError(
+            "many columns have the same place",
+            f"{where}, column {first[most] + 1}",
+            f"at most {_MOST_ON_A_PIXEL} columns on a pixel",
+            f"{number[most]} on the pixel at x {x:.0f}, y {y:.0f}",
+            "Keep one of them",
+        )
 
 
 def _numbered(column_ids: Sequence[int | None], next_id: int, where: str) -> list[int]:
@@ -293,6 +314,7 @@ def refine(scene: Scene, columns: xr.Dataset, spacing_px: float | None = None) -
     """
     summed = _summed(scene.sum, _stamp(scene.sum))
     settings, window, corner = scene.columns, scene.window_px, np.zeros(2, dtype=np.int64)
+    _check_windows(columns, window, spacing_px or settings.spacing_px, summed["image"].size)
     if spacing_px is not None:
         settings = dataclasses.replace(settings, spacing_px=spacing_px)
         window = window or default_window(spacing_px)
@@ -302,6 +324,22 @@ def refine(scene: Scene, columns: xr.Dataset, spacing_px: float | None = None) -
     found = find_columns(summed, settings, seeds=moved, blur_sigma_px=scene.blur_sigma_px, window_px=window)
     found = found.assign(x_ref=found["x_ref"] + corner[0], y_ref=found["y_ref"] + corner[1])
     return {"columns": to_records(found)} | {name: found.attrs[name] for name in ("merged", "spacing_px", "window_px")}
+
+
+def _check_windows(columns: xr.Dataset, window_px: int | None, spacing_px: float | None, image_px: int) -> None:
+    """Check that the windows of many columns can be fitted while somebody waits."""
+    number = columns.sizes["column_id"]
+    spacing = spacing_px or neighbour_distance(positions(columns))
+    side = window_px or (default_window(spacing) if spacing else 0)
+    most = min(_MOST_COVER * image_px, _MOST_WINDOW_PX) // max(side, 1) ** 2
+    if number > max(_FEW, most):
+        raise SettingsError(
+            "the windows of these columns are too large to refine so many at once",
+            "columns",
+            f"at most {max(_FEW, most)} columns with windows of {side} px",
+            str(number),
+            "Refine fewer columns at a time; or check spacing_px",
+        )
 
 
 def lattice_sites(
@@ -338,7 +376,7 @@ def lattice_sites(
     known: NDArray[np.bool_] = np.zeros(len(places), dtype=bool)
     if len(there):
         reach = _SAME * min(spacing, neighbour_distance(there) or spacing)
-        known = inside & (np.asarray(cKDTree(there).query(places)[0]) <= reach)
+        known = inside & (np.asarray(cKDTree(np.unique(there, axis=0)).query(places)[0]) <= reach)
     kept = np.flatnonzero(inside & ~known)
     check_sites(len(kept), where, MOST_COLUMNS)
     found = column_dataset(places[kept], sites["kind"].to_numpy()[kept].tolist())

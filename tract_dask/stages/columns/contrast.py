@@ -60,7 +60,7 @@ def _neighbours(places: Places, lattice: Lattice | None) -> Reals:
     if lattice is None or len(places) < 2:
         return np.ones(len(places))
     sites = places[:, None] + lattice.translations(1)
-    away = np.asarray(cKDTree(places).query(sites)[0])
+    away = np.asarray(cKDTree(np.unique(places, axis=0)).query(sites)[0])
     return np.asarray((away < TOLERANCE * lattice.spacing).mean(axis=1))
 
 

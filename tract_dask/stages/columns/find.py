@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ...errors import InputError, SettingsError
 from ...kernels.filling import fill_near
@@ -36,6 +35,7 @@ from .lattice import (
     without_holes,
 )
 from .sites import lattice_sites
+from .twins import twins_of
 from .window_size import neighbour_distance, resolve_window
 
 _SAME = 1 / 3
@@ -165,7 +165,7 @@ def find_columns(
         fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
     fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
     places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], best.places)
-    twins = _twins(places, _SAME * best.spacing)
+    twins = twins_of(places, _SAME * best.spacing)
     kept = np.setdiff1d(np.arange(len(places)), list(twins))
     kept = kept if found.fixed else kept[_reading_order(places[kept], best.spacing / 3)]
     ids = found.number[kept] if found.fixed else np.arange(1, len(kept) + 1)
@@ -323,7 +323,7 @@ def _on_lattices(scene: _Scene, settings: ColumnSettings) -> tuple[_Seeds, float
     sites = lattice_sites(settings.lattices, scene.valid.shape)
     seeds = _Seeds(positions(sites), schema.texts(sites["kind"].to_numpy()), sites["column_id"].to_numpy(), False)
     finest = settings.spacing_px or sites.attrs["spacing_px"]
-    shared = _twins(seeds.places, _SAME * finest)
+    shared = twins_of(seeds.places, _SAME * finest)
     distinct = np.delete(seeds.places, list(shared), axis=0)
     return seeds, settings.spacing_px or neighbour_distance(distinct) or finest
 
@@ -382,10 +382,9 @@ def _odd_shapes(
 ) -> NDArray[np.bool_]:
     """Return which fits failed or are of a shape unusual for their kind; bind theirs to the usual one, in place."""
     odd = np.zeros(len(kind), dtype=bool)
-    for name in np.unique(kind):
-        same = kind == name
-        if same.sum() < _FEWEST_FOR_SHAPE:
-            continue
+    _, number, count = np.unique(kind, return_inverse=True, return_counts=True)
+    for common in np.flatnonzero(count >= _FEWEST_FOR_SHAPE):
+        same = number == common
         usual = np.nanmedian(fits.estimates[same][:, [SIGMA_A, SIGMA_B]], axis=0)
         too_wide = fits.estimates[:, SIGMA_A] > usual[0] * _SHAPE_FACTOR
         too_narrow = fits.estimates[:, SIGMA_B] < usual[1] / _SHAPE_FACTOR
@@ -413,15 +412,6 @@ def _bounds(windows: NDArray[np.float32], at: Places, sign: int, search: float) 
     lower[:, THETA], upper[:, THETA] = -np.inf, np.inf
     lower[:, BACKGROUND], upper[:, BACKGROUND] = low - 5 * span, high + 5 * span
     return start, lower, upper
-
-
-def _twins(places: Places, distance: float) -> dict[int, int]:
-    """Return which places to drop, each with the one that stands for it: an earlier one within ``distance``."""
-    twins: dict[int, int] = {}
-    for first, second in sorted(map(sorted, cKDTree(places).query_pairs(distance, output_type="ndarray").tolist())):
-        if first not in twins:
-            twins.setdefault(second, first)
-    return twins
 
 
 def _reading_order(places: Places, thickness: float) -> NDArray[np.int64]:

@@ -16,8 +16,11 @@ def neighbour_distance(places: NDArray[np.float64]) -> float | None:
         return None
     from scipy.spatial import cKDTree  # takes its time, and workers do not need it
 
-    distances = np.asarray(cKDTree(places).query(places, k=2)[0])
-    return float(np.median(distances[:, 1])) or None
+    apart, back, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+    nearest = np.zeros(len(apart))  # of a tree, all places that are the same one would be compared with each other
+    if len(apart) > 1:
+        nearest[count == 1] = np.asarray(cKDTree(apart).query(apart[count == 1], k=2)[0]).reshape(-1, 2)[:, 1]
+    return float(np.median(nearest[back.ravel()])) or None
 
 
 def default_window(spacing_px: float) -> int:
