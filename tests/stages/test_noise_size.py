@@ -9,6 +9,7 @@ import xarray as xr
 
 from tract_dask import convert, fit_columns, open_movie
 from tract_dask.settings import FitSettings
+from tract_dask.stages.fit.goodness import Freedom, freedom, p_values
 from tract_dask.stages.fit.noise_size import FEWEST_DEGREES, frame_noise, window_noise
 from tract_dask.store.columns import column_dataset
 
@@ -106,6 +107,32 @@ def test_p_values_tell_a_column_that_is_two(tmp_path):
     assert np.delete(share, [6, 18]).max() < 0.15
 
 
+@pytest.mark.parametrize(("size", "blur", "psf"), [(21, 2.0, 0.0), (15, 0.0, 0.8), (15, 1.5, 1.0)])
+def test_p_values_are_uniform_where_pixels_share_noise(size, blur, psf):
+    """4,000 residuals of drawn noise: 0.5 to 2 % below 1 %, and 4 to 6 % below 5 % and above 95 %."""
+    from scipy.ndimage import gaussian_filter1d
+
+    lag, wide = np.arange(-6, 7), np.hypot(3.5, blur)
+    shared = np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * psf**2)) if psf else None
+    settings = FitSettings(counting=False, filter="gaussian" if blur else "none", blur_sigma_px=blur or 2.0)
+    free = freedom(np.array([1.0, 0, 0, wide, wide, 0, 0]), size, settings, shared)
+    images = np.random.default_rng(2).normal(size=(4000, size + 16, size + 16)).astype(np.float32)
+    for sigma in (blur, psf):
+        for axis in (1, 2) if sigma else ():
+            images = gaussian_filter1d(images, sigma, axis=axis)
+    y, x = np.indices((size, size)) - size // 2
+    disc = np.hypot(y, x) <= size / 2
+    shape = np.exp(-(y**2 + x**2) / (2 * wide**2))
+    basis = np.linalg.qr(np.stack([shape, np.ones_like(shape), x * shape, y * shape])[:, disc].T)[0]
+    pixels = images[:, 8:-8, 8:-8][:, disc]
+    squares = (pixels**2).sum(axis=1) - ((pixels @ basis) ** 2).sum(axis=1)
+    level = np.full(len(squares), np.inf)
+    found = p_values(squares[None] / squares.mean(), np.ones(1), np.ones(4000), level, free, np.array([10**6]))
+    assert 0.005 < (found < 0.01).mean() < 0.02
+    assert (found < 0.05).mean() == pytest.approx(0.05, abs=0.01)
+    assert (found > 0.95).mean() == pytest.approx(0.05, abs=0.01)
+
+
 def test_a_free_shape_on_its_bound_states_no_error_of_its_intensity(tmp_path):
     fits, places = fitted(Row(16, *BRIGHT, {"shape": "free", "blur_sigma_px": 0.96}), tmp_path)
     bound = (fits["status"].to_numpy() & 32) > 0
@@ -119,14 +146,15 @@ def test_the_size_of_the_noise_is_that_of_most_windows():
     rng = np.random.default_rng(1)
     ratio = 2.5 * rng.chisquare(12, (40, 60)) / 12 * 0.6
     ratio[:, ::12] *= 9  # columns with a neighbour that the model does not know
-    size = frame_noise(ratio, np.ones(ratio.shape, bool), np.full(60, 0.6), 12.0)
+    size, number = frame_noise(ratio, np.ones(ratio.shape, bool), np.full(60, 0.6), Freedom(12.0, 12.0, 0.0))
+    assert (number == 60).all()
     assert size.mean() == pytest.approx(2.5, rel=0.1)
 
 
 def test_a_few_degrees_of_freedom_do_not_tell_the_size():
-    ratio = np.ones((1, 2))
-    assert np.isnan(frame_noise(ratio, np.ones((1, 2), bool), np.ones(2), FEWEST_DEGREES / 2.1)).all()
-    assert np.isnan(frame_noise(ratio, np.zeros((1, 2), bool), np.ones(2), 50.0)).all()
+    ratio, few, many = np.ones((1, 2)), *(Freedom(k, k, 0.0) for k in (FEWEST_DEGREES / 2.1, 50.0))
+    assert np.isnan(frame_noise(ratio, np.ones((1, 2), bool), np.ones(2), few)[0]).all()
+    assert np.isnan(frame_noise(ratio, np.zeros((1, 2), bool), np.ones(2), many)[0]).all()
 
 
 def test_degrees_of_freedom_are_those_of_the_residual():
@@ -146,5 +174,6 @@ def test_degrees_of_freedom_are_those_of_the_residual():
     basis = np.linalg.qr(slopes.T)[0]
     pixels = images[:, disc]
     squares = (pixels**2).sum(axis=1) - ((pixels @ basis) ** 2).sum(axis=1)
-    assert noise.degrees == pytest.approx(2 * squares.mean() ** 2 / squares.var(), rel=0.1)
+    assert noise.free.degrees == pytest.approx(2 * squares.mean() ** 2 / squares.var(), rel=0.1)
+    assert noise.free.median == pytest.approx(np.median(squares) / squares.mean(), rel=0.01)
     assert noise.left[0] == pytest.approx(squares.mean() / (pixels**2).sum(axis=1).mean(), rel=0.03)

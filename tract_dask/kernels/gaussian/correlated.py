@@ -1,14 +1,15 @@
 """Errors of fits where pixels share their noise: what they are, in units of those that white noise would give.
 
 With the slopes J of the model, H = J^T J and noise of covariance C, the estimates have the covariance
-H^-1 (J^T C J) H^-1, and the residual's sum of squares the expectation tr C - tr(H^-1 J^T C J), from which the size of C
-is taken. Both are evaluated twice: for white noise, and for noise with the autocorrelation that was measured, both
-after the blur; for maximum likelihood with every pixel in units of its own standard deviation.
+H^-1 (J^T C J) H^-1, and the residual's sum of squares the expectation tr C - tr(H^-1 J^T C J), from which the size of
+C can be taken. Both are evaluated twice: for white noise, and for noise with the autocorrelation that was measured,
+both after the blur; for maximum likelihood with every pixel in units of its own standard deviation.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,22 @@ _ALIKE = 0.05
 """Columns whose shape and contrast differ by less than this share have the same factors."""
 
 
-def error_factors(
+class SharedNoise(NamedTuple):
+    """What noise that pixels share does, over what white noise of the same size does.
+
+    Attributes
+    ----------
+    errors
+        (n, 8) standard errors: Equation 1's seven, and the volume.
+    left
+        (n,) what a fit leaves of the noise's sum of squares.
+    """
+
+    errors: Floats
+    left: Floats
+
+
+def shared_noise(
     parameters: Floats,
     size: int,
     correlation: Floats,
@@ -32,8 +48,8 @@ def error_factors(
     fixed_shape: bool = True,
     counting: bool = True,
     likelihood: bool = False,
-) -> Floats:
-    """Return by what the stated errors of columns are to be multiplied, (n, 8): Equation 1's seven, and the volume.
+) -> SharedNoise:
+    """Return by what errors for white noise of a known size, and what fits leave of it, are to be multiplied.
 
     Parameters
     ----------
@@ -53,7 +69,8 @@ def error_factors(
         _factors(parameters[k], size, correlation, kernel, (fixed_shape, counting or likelihood, likelihood))
         for k in first
     ]
-    return np.array(found).reshape(-1, 8)[which.ravel()]
+    factors = np.array(found).reshape(-1, 9)[which.ravel()]
+    return SharedNoise(factors[:, :8], factors[:, 8])
 
 
 def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how: tuple[bool, bool, bool]) -> Floats:
@@ -84,19 +101,19 @@ def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how
     lag = np.arange(-reach, reach + 1)
     lags[np.ix_(lag % padded[0], lag % padded[1])] = correlation
     traces = _traces(variance[disc], correlation, kernel, likelihood=likelihood)
-    errors = []
+    errors, remains = [], []
     white = np.ones((padded[0], padded[1] // 2 + 1))
     for spectrum, trace in zip((white, np.fft.rfft2(lags).real), traces, strict=True):
         shared = np.fft.irfft2(own * spectrum, padded)[:, :side, :side].reshape(len(images), -1)
         meat = images.reshape(len(images), -1) @ shared.T
         covariance = hessian @ meat @ hessian
-        left = trace - float(np.trace(hessian @ meat))
-        variances = np.append(covariance.diagonal(), volume @ covariance @ volume)
-        errors.append(variances / left if left > 0 else np.full(variances.size, np.nan))
+        remains.append(trace - float(np.trace(hessian @ meat)))
+        errors.append(np.append(covariance.diagonal(), volume @ covariance @ volume))
     with np.errstate(invalid="ignore", divide="ignore"):
         x, y, amplitude, background, *shapes, of_volume = np.sqrt(errors[1] / errors[0])
     widths = max(shapes, default=math.nan)
-    return np.array([amplitude, x, y, *(widths if shapes else 1.0,) * 3, background, of_volume])
+    left = max(remains[1] / remains[0], 0.0) if remains[0] > 0 else 1.0
+    return np.array([amplitude, x, y, *(widths if shapes else 1.0,) * 3, background, of_volume, left])
 
 
 def _traces(variance: Floats, correlation: Floats, kernel: Floats, *, likelihood: bool) -> tuple[float, float]:

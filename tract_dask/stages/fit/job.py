@@ -12,7 +12,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ...errors import SettingsError
-from ...kernels.gaussian.correlated import error_factors
 from ...kernels.gaussian.intensity import Floats
 from ...kernels.gaussian.model import blurred
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
@@ -162,21 +161,6 @@ class Job:
         return np.float32(0 if self.settings.filters_frames else (self.offset - self.dark_variance) / self.unit)
 
     @cached_property
-    def error_factors(self) -> Floats:
-        """(columns, 8) by what noise that pixels share changes stated errors: 1 where they share none."""
-        if self.correlation is None:
-            return np.ones((len(self.reference), 8))
-        return error_factors(
-            self.reference,
-            self.window_px,
-            np.array(self.correlation),
-            blur_sigma_px=self.settings.window_blur_px,
-            fixed_shape=self.settings.shape == "fixed",
-            counting=self.settings.counting,
-            likelihood=self.settings.estimator == "poisson",
-        )
-
-    @cached_property
     def filters(self) -> Filters:
         """The matched filter of each column, by which it is told whether it is there."""
         return matched_filters(self.reference, self.window_px, self.settings.window_blur_px)
@@ -184,7 +168,8 @@ class Job:
     @cached_property
     def window_noise(self) -> WindowNoise:
         """What each column's window does with noise."""
-        return window_noise(self.reference, self.window_px, self.settings)
+        shared = None if self.correlation is None else np.array(self.correlation)
+        return window_noise(self.reference, self.window_px, self.settings, shared)
 
     @cached_property
     def in_units(self) -> Job:

@@ -23,10 +23,11 @@ from ...store.shards import Shard
 from .common_motion import common_motion, masked_median
 from .filters import above_offset, filter_frame
 from .frame_fits import FrameFits
+from .goodness import p_values
 from .incomplete import cut_raw, fit_incomplete
 from .job import Job
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
-from .noise_size import frame_noise, p_values
+from .noise_size import frame_noise
 
 Values = dict[str, np.ndarray[Any, Any]]
 
@@ -117,13 +118,15 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
     """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
     good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None])
-    size = frame_noise(in_frame.ratio, good, job.window_noise.left, job.window_noise.degrees)
+    window = job.window_noise
+    size, number = frame_noise(in_frame.ratio, good, window.left, window.free)
     in_frame, unknown = in_frame.with_noise(size), in_frame.incomplete | job.settings.filters_frames
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
     status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
     drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     fits.estimates[..., BACKGROUND] -= job.dark_variance
+    chance = p_values(in_frame.ratio, size, window.left, window.level, window.free, number)
     intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale, job.dark_variance)
     return {
         "fit": fits.estimates,
@@ -136,7 +139,7 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
         "presence": np.where(places.lost[:, None], np.nan, fits.strength * precision),
         "presence_vacuum": empty,
         "r_squared": fits.r_squared,
-        "p_value": np.where(unknown, np.float32(np.nan), p_values(in_frame.ratio, size, job.window_noise)),
+        "p_value": np.where(unknown, np.nan, chance).astype(np.float32),
         "n_iterations": fits.n_iterations,
         "drift": drift,
         "noise": job.unit * noise,
@@ -264,9 +267,8 @@ def _fit_windows(
         counting=settings.counting,
         own_noise=False,
     )
-    shared = job.error_factors[which]
-    fits.stderr[:] *= np.nan if settings.filters_frames else job.window_noise.errors[which] * shared[:, :7]
-    fits.volume_stderr[:] *= np.nan if settings.filters_frames else job.window_noise.volume[which] * shared[:, 7]
+    fits.stderr[:] *= np.nan if settings.filters_frames else job.window_noise.errors[which]
+    fits.volume_stderr[:] *= np.nan if settings.filters_frames else job.window_noise.volume[which]
     if settings.shape == "free":  # a sigma on its bound moves amplitude and background by more than they scatter
         fits.stderr[fits.at_bound, AMPLITUDE] = fits.stderr[fits.at_bound, BACKGROUND] = np.nan
         fits.volume_stderr[fits.at_bound] = np.nan

@@ -15,14 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincc
 
+from ...kernels.gaussian.correlated import shared_noise
 from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.information import model_slopes
 from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ...kernels.windows import gaussian_kernel
 from ...settings.run import FitSettings
+from .goodness import Freedom, freedom
 
 Floats = NDArray[np.float64]
 
@@ -30,8 +31,6 @@ FEWEST_DEGREES = 10.0
 """The size of the noise is not taken from fewer degrees of freedom."""
 
 _WIDTHS = 16
-_LARGEST_PX = 31
-"""Degrees of freedom are counted in a window no larger than this: a larger one is shrunk, with all that is in it."""
 
 
 class WindowNoise(NamedTuple):
@@ -45,25 +44,21 @@ class WindowNoise(NamedTuple):
         (columns,) the same for volumes.
     left
         (columns,) share of the noise's sum of squares that a fit leaves.
-    degrees
-        Effective degrees of freedom of a window: twice the squared mean of its residual's sum of squares over its
-        variance.
+    free
+        Degrees of freedom of a window's residual.
     level
-        (columns,) mean counts of a pixel; infinite where the noise is not that of counts.
-    grain
-        By how much the squares of counts scatter more than those of a normal distribution: the share of the variance
-        of a sum of squares, times the electrons in a pixel.
+        (columns,) mean counts of a pixel over the pixels that share an electron; infinite where the noise is not that
+        of counts.
     """
 
     errors: Floats
     volume: Floats
     left: Floats
-    degrees: float
+    free: Freedom
     level: Floats
-    grain: float
 
 
-def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowNoise:
+def window_noise(reference: Floats, size: int, settings: FitSettings, correlation: Floats | None = None) -> WindowNoise:
     """Return what windows do with noise, for columns of this shape after the blur.
 
     Parameters
@@ -72,24 +67,53 @@ def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowN
         (columns, 7) of Equation 1; where they are does not matter.
     size
         Diameter of the round windows, px.
+    correlation
+        (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; None: they share none.
     """
+    noise = _of_white(reference, size, settings)
+    if correlation is None:
+        return noise
+    shared = shared_noise(
+        reference,
+        size,
+        correlation,
+        blur_sigma_px=settings.window_blur_px,
+        fixed_shape=settings.shape == "fixed",
+        counting=settings.counting,
+        likelihood=settings.estimator == "poisson",
+    )
+    return WindowNoise(
+        noise.errors * shared.errors[:, :7],
+        noise.volume * shared.errors[:, 7],
+        noise.left * shared.left,
+        freedom(_middle(reference), size, settings, correlation),
+        noise.level / correlation.sum(),
+    )
+
+
+def _middle(reference: Floats) -> Floats:
+    """Return the column of the median width."""
+    width = reference[:, SIGMA_A] * reference[:, SIGMA_B]
+    return reference[np.argsort(width, kind="stable")[len(width) // 2]]
+
+
+def _of_white(reference: Floats, size: int, settings: FitSettings) -> WindowNoise:
+    """Return what windows do with noise of which pixels share none."""
     width = np.sqrt(reference[:, SIGMA_A] * reference[:, SIGMA_B])
     order = np.argsort(width, kind="stable")
     chosen = order[np.unique(np.linspace(0, len(order) - 1, _WIDTHS).round().astype(int))]
     some = reference[chosen].copy()
     some[:, [X, Y]] = size // 2
     nearest = np.abs(np.log(width[:, None] / width[chosen])).argmin(axis=1)
-    degrees = _degrees(some[len(some) // 2], size, settings)
+    free = freedom(_middle(reference), size, settings)
     counts = np.array([evaluate(column, *_places(size)).mean() for column in some])[nearest]
     counted = (settings.counting or settings.estimator == "poisson") & (counts > 0)
     level = np.where(counted, counts, np.inf)
-    kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
-    grain = (kernel @ kernel) ** 4 / (2 * (np.convolve(kernel, kernel) ** 2).sum() ** 2)
     if settings.estimator == "poisson":
-        free = 4 if settings.shape == "fixed" else 7
-        share = 1 - free / np.count_nonzero(_disc(size))
+        parameters = 4 if settings.shape == "fixed" else 7
+        share = 1 - parameters / np.count_nonzero(_disc(size))
         ones = np.ones((len(reference), 7))
-        return WindowNoise(ones, ones[:, 0], share * ones[:, 0], degrees, level, grain)
+        return WindowNoise(ones, ones[:, 0], share * ones[:, 0], free, level)
     exact = [_exact(column, size, settings) for column in some]
     bounds = np.full(7, np.inf)
     images = evaluate(some, np.arange(size), np.arange(size)[:, None]).astype(np.float32)
@@ -109,11 +133,13 @@ def window_noise(reference: Floats, size: int, settings: FitSettings) -> WindowN
         volume = np.array([volume for _, volume, _ in exact]) / stated.volume_stderr
     errors, volume = np.where(errors > 0, errors, 1.0), np.where(volume > 0, volume, 1.0)
     left = np.array([left for _, _, left in exact])
-    return WindowNoise(errors[nearest], volume[nearest], left[nearest], degrees, level, grain)
+    return WindowNoise(errors[nearest], volume[nearest], left[nearest], free, level)
 
 
-def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, degrees: float) -> Floats:
-    """Return the size of each frame's noise, (frames,); NaN where its windows do not tell.
+def frame_noise(
+    ratio: Floats, good: NDArray[np.bool_], left: Floats, free: Freedom
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the size of each frame's noise, (frames,), and how many windows tell it; NaN where they do not.
 
     Parameters
     ----------
@@ -123,46 +149,16 @@ def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, degrees: f
         (frames, columns) fits that count.
     left
         (columns,) share of the noise that a fit leaves.
-    degrees
-        Of freedom in a window.
-
-    Notes
-    -----
-    The median of chi-squared over its k degrees of freedom is (1 - 2 / 9k)^3 (Wilson and Hilferty, 1931).
+    free
+        Degrees of freedom in a window.
     """
     good = good & np.isfinite(ratio) & (left > 0)
     sizes = np.where(good, ratio / np.where(left > 0, left, 1.0), np.nan)
-    size = np.full(len(ratio), np.nan)
-    enough = (good.sum(axis=1) * degrees >= FEWEST_DEGREES) & good.any(axis=1)
+    size, number = np.full(len(ratio), np.nan), good.sum(axis=1)
+    enough = (number * free.degrees >= FEWEST_DEGREES) & (number > 0)
     if enough.any():
-        size[enough] = np.nanmedian(sizes[enough], axis=1) / (1 - 2 / (9 * max(degrees, 0.5))) ** 3
-    return size
-
-
-def p_values(ratio: Floats, size: Floats, noise: WindowNoise) -> NDArray[np.float32]:
-    """Return how probable so large a residual is where one Gaussian is all that there is, (frames, columns).
-
-    Parameters
-    ----------
-    ratio
-        (frames, columns) the residuals' sums of squares over what the noise alone has.
-    size
-        (frames,) of the noise, from :func:`frame_noise`.
-
-    Returns
-    -------
-    NDArray
-        The upper tail of chi-squared; uniform from 0 to 1 where the model is right. NaN where the noise is not known.
-
-    Notes
-    -----
-    A count of mean m has the excess kurtosis 1 / m, which leaves so much fewer degrees of freedom.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        electrons = noise.level / size[:, None]
-        degrees = noise.degrees / (1 + noise.grain / electrons)
-        squares = degrees * ratio / (size[:, None] * np.where(noise.left > 0, noise.left, np.nan))
-    return np.asarray(gammaincc(degrees / 2, squares / 2), np.float32)
+        size[enough] = np.nanmedian(sizes[enough], axis=1) / free.median
+    return size, number
 
 
 def _places(size: int) -> tuple[Floats, Floats]:
@@ -206,22 +202,3 @@ def _exact(column: Floats, size: int, settings: FitSettings) -> tuple[Floats, fl
     errors = np.full(7, np.nan)
     errors[[X, Y, AMPLITUDE, BACKGROUND]] = np.sqrt(covariance.diagonal()[:4])
     return errors, float(np.sqrt(by_volume @ covariance @ by_volume)), left
-
-
-def _degrees(column: Floats, size: int, settings: FitSettings) -> float:
-    """Return the effective degrees of freedom of a window: (trace P C)^2 / trace (P C)^2, P beside the fit's slopes."""
-    shrink = max(1.0, size / _LARGEST_PX)
-    side = 2 * round((size / shrink - 1) / 2) + 1
-    small = column.copy()
-    small[[SIGMA_A, SIGMA_B]] /= shrink
-    small[[X, Y]] = side // 2
-    _, slopes, _ = model_slopes(small, *_places(side), fixed_shape=settings.shape == "fixed")
-    basis = np.linalg.qr((slopes / np.sqrt((slopes**2).sum(axis=1))[:, None]).T)[0]
-    kernel = gaussian_kernel(settings.window_blur_px / shrink).astype(np.float64)
-    twice = np.pad(np.convolve(kernel, kernel), (side, side))
-    middle = twice.size // 2
-    y, x = np.nonzero(_disc(side))
-    noise = twice[middle + y[:, None] - y] * twice[middle + x[:, None] - x]
-    left = noise - basis @ (basis.T @ noise)
-    left -= (left @ basis) @ basis.T
-    return float(np.trace(left) ** 2 / (left**2).sum())
