@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from ..analysis.overview import UNLIKELY
+from ..settings.run import FitSettings
 from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
@@ -35,7 +36,8 @@ LONG_STEP = 0.4
 POOR_QUALITY = 0.5
 """A frame that correlates with the sum by less than this share of the usual is named."""
 RESIDUAL = 0.15
-"""Residual of a fit on the summed image, as a share of the amplitude, that is worth a look."""
+"""Residual of a fit on the summed image, as a share of the amplitude, that is worth a look where noise does not explain
+it."""
 UNLIKE, UNLIKE_OTHERS = 0.1, 5.0
 """A column is not one Gaussian where a larger share of its fits is unlike one, and larger by this factor than usual:
 noise that is not as the fit takes it is so in all columns."""
@@ -237,23 +239,23 @@ def _columns(run: Survey) -> Iterator[Finding]:
         yield Finding("never_fitted", "Columns at the edge were not fitted", text, remedy, serious=False)
     if sometimes.any():
         text = f"The window of {_of_columns(ids[sometimes])} leaves the image in some frames, as the specimen drifts."
-        yield Finding("at_the_edge", "Columns near the edge are missing at times", text, serious=False)
-    poor = columns["residual"].to_numpy() > RESIDUAL
-    if poor.any():
-        text = (
-            f"In the summed image the fit leaves more than {RESIDUAL:.0%} of the amplitude (rms) for "
-            f"{_of_columns(ids[poor])}: a neighbour reaches into the window, or the column is not a Gaussian."
+        remedy = "Nothing is wrong. A smaller window (--window-px) reaches closer to the edge."
+        yield Finding("at_the_edge", "Columns near the edge are missing at times", text, remedy, serious=False)
+    poor = (columns["residual"].to_numpy() > RESIDUAL) & ~(columns["p_value"].to_numpy() > UNLIKELY)
+    unlike = _unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy())
+    if (poor | unlike).any():
+        seen = {
+            f"the fit on the summed image leaves more than {RESIDUAL:.0%} of the amplitude (rms), more than noise does,"
+            f" for {_of_columns(ids[poor])}": poor,
+            f"more than {UNLIKE:.0%} of the fits leave far more than noise for {_of_columns(ids[unlike])}": unlike,
+        }
+        text = "; ".join(words for words, which in seen.items() if which.any())
+        text = f"{text[:1].upper()}{text[1:]}. A neighbour reaches into the window, or the column is not a Gaussian."
+        remedy = (
+            "See the residuals below. A smaller window (--window-px) keeps neighbours out. Add a column that is "
+            "missing to columns.csv, and run again."
         )
-        remedy = "See the residuals below; a smaller window (--window-px) keeps neighbours out."
-        yield Finding("residual", "Some columns do not look like Gaussians", text, remedy)
-    unlike = _unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy()) & ~poor
-    if unlike.any():
-        text = (
-            f"More than {UNLIKE:.0%} of the fits leave far more than the noise for {_of_columns(ids[unlike])}: "
-            "a second column is close by, or what is there is not a Gaussian."
-        )
-        remedy = "Look at them in the summed image; add the column that is missing to columns.csv and run again."
-        yield Finding("one_gaussian", "One Gaussian is not enough here", text, remedy)
+        yield Finding("one_gaussian", "One Gaussian is not enough for some columns", text, remedy)
 
 
 def _unlike_one(number: NDArray[np.int64], accepted: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -312,9 +314,13 @@ def _flags(run: Survey) -> Iterator[Finding]:
         yield Finding("at_bound", "Many fits ended on a bound", text, remedy)
     if share["not_converged"] > UNSETTLED:
         text = f"{share['not_converged']:.1%} of all fits did not settle."
-        yield Finding(
-            "not_converged", "Many fits did not settle", text, "Usually the dose is too low for these columns."
+        steps, usual = run.settings.fit.max_iterations if run.settings else 0, FitSettings().max_iterations
+        remedy = (
+            f"They were stopped after {steps} steps: run again with --set fit.max_iterations={usual}."
+            if 0 < steps < usual
+            else "The dose is too low for these columns: sum frames (rebin_frames), or remove what is not a column."
         )
+        yield Finding("not_converged", "Many fits did not settle", text, remedy)
     if share["shape_at_bound"] > SHAPES_AT_BOUND:
         text = (
             f"In {share['shape_at_bound']:.1%} of all fits a free width ended on its bound; their places are accepted."
@@ -328,7 +334,7 @@ def _why_no_errors(run: Survey) -> tuple[str, str]:
     fit = run.settings.fit if run.settings else None
     if fit is None or fit.filters_frames:
         text = "The fits state no errors of the positions; after the filters wiener and tv-l1 they are not known."
-        return text, "Take the spread of columns that keep still."
+        return text, "Take the spread of columns that keep still, or run again with --filter gaussian."
     text = (
         f"The fits state no errors of the positions: after a blur of {fit.window_blur_px:g} px too few pixels are "
         f"independent in a window that is {run.tracks.attrs['window_px']} px across."
@@ -360,9 +366,11 @@ def _drift(run: Survey) -> Iterator[Finding]:
     if (span > LONG_DRIFT * side).any():
         axis = int(np.argmax(span / side))
         text = f"Along {AXES[axis]} it spans {span[axis]:.0f} px, {span[axis] / side[axis]:.0%} of the image."
-        yield Finding(
-            "long_drift", "The drift is long", text, "Columns near the edges are seen in part of the frames only."
+        remedy = (
+            "Columns near the edges are seen in part of the frames only. Where that matters, run parts of the movie "
+            "(--frames)."
         )
+        yield Finding("long_drift", "The drift is long", text, remedy)
     spacing = run.tracks.attrs["window_px"] * 2.0 if (found := _spacing(run)) is None else found
     step = np.hypot(*np.diff(run.frames["drift_measured"].to_numpy(), axis=0).T) if len(drift) > 1 else np.zeros(1)
     if (step > LONG_STEP * spacing).any():

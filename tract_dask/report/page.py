@@ -32,7 +32,8 @@ from ..web.bundle import STATIC
 from . import interactive
 from .findings import RESIDUAL, count, findings
 from .pictures import MASK_COLOURS, figure_data, mask_data, windows_data
-from .survey import Survey, events_of, median, percentiles, residual_windows, survey
+from .residuals import residual_windows
+from .survey import Survey, events_of, median, percentiles, survey
 
 _SCRIPT = Path(__file__).parent / "page.js"
 KEY = '<meta name="tract-dask-key" content="'
@@ -249,6 +250,7 @@ def worst_columns(run: Survey) -> list[dict[str, Any]]:
                 "why": ", ".join(why),
                 "share": _percent(int(own["accepted"]), int(own["fits"])),
                 "residual": f"{float(own['residual']):.1%}" if np.isfinite(own["residual"]) else "-",
+                "p_value": f"{float(own['p_value']):.2g}" if np.isfinite(own["p_value"]) else "-",
                 "spread": _number(float(own["spread"]), run.known.unit),
                 "expected": _number(float(own["expected"]), run.known.unit),
                 "r_squared": _number(float(own["r_squared"])),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +16,6 @@ from ..analysis import overview
 from ..analysis.jumps import noise_factor
 from ..analysis.overview import Floats
 from ..errors import SettingsError
-from ..kernels.gaussian.model import evaluate
-from ..kernels.gaussian.parameters import AMPLITUDE, X, Y
-from ..kernels.windows import blur
 from ..settings.run import RunSettings
 from ..settings.toml import load
 from ..store import datasets, metadata, results, schema
@@ -26,6 +23,7 @@ from ..store.files import read_small
 from ..store.pixels import GROUP
 from ..store.run_folder import RunFolder
 from ..store.strangers import strangers
+from .residuals import Residuals, residuals
 
 VALUES = 1_600_000
 """Numbers that the series of all columns together may have: 4 MB of the page."""
@@ -52,8 +50,8 @@ class Survey:
     known
         Units: lengths are in pm, or in px where the size of a pixel is not known.
     columns
-        Over column_id: x_ref, y_ref, kind, the numbers of :meth:`.overview.ColumnSums.numbers`, and ``residual``, of
-        the fit on the summed image, see :func:`residuals`.
+        Over column_id: x_ref, y_ref, kind, the numbers of :meth:`.overview.ColumnSums.numbers`, and ``residual`` and
+        ``p_value`` of the fit on the summed image, see :class:`.residuals.Residuals`.
     frames
         Over frame: time, drift, drift_measured (frame, axis), the numbers of :meth:`.overview.Part.frames`, ``share``
         of accepted fits, and ``quality`` of the drift where it was measured.
@@ -118,15 +116,18 @@ def survey(folder: Path, events: list[dict[str, Any]]) -> Survey:
     known = overview.Calibration.of(about)
     measured = tracks.assign_attrs(pixel_size_pm=known.scale)
     columns, frames, series = gathered(measured, None if small else results.variables(places.results))
-    others = strangers(folder)
+    others, settings = strangers(folder), _settings(places.settings)
     if places.drift.exists() and places.drift not in others:
         frames["quality"] = ("frame", datasets.open_dataset(places.drift)["quality"].to_numpy())
-    columns["residual"] = ("column_id", residuals(tracks, summed))
+    left = residuals(tracks, summed, float(metadata.attributes(places.movie).get("gain", 1.0)), settings)
+    columns = columns.assign(
+        {name: ("column_id", values) for name, values in zip(Residuals._fields, left, strict=True)}
+    )
     return Survey(
         folder=folder,
         tracks=measured,
         about=about | {"movie": metadata.attributes(places.movie), "strangers": [path.name for path in others]},
-        settings=_settings(places.settings),
+        settings=settings,
         known=known,
         columns=columns,
         frames=frames,
@@ -196,48 +197,6 @@ def frame_curves(frames: xr.Dataset) -> dict[str, Floats]:
     """Return the numbers over frame, averaged until a curve has no more points than a screen can show."""
     known = {str(name): values.to_numpy() for name, values in frames.items() if values.dims == ("frame",)}
     return overview.frame_curves(known, -(-frames.sizes["frame"] // _FRAMES))
-
-
-def residuals(tracks: xr.Dataset, summed: xr.Dataset) -> Floats:
-    """Return the rms residual of each column's fit on the summed image, as a share of its amplitude.
-
-    It is that of the pixels of the round window; NaN where a column was not fitted in the summed image.
-    """
-    amplitudes = np.abs(tracks["fit_ref"].to_numpy()[:, AMPLITUDE].astype(np.float64))
-    shown = residual_windows(tracks, summed, range(len(amplitudes)))
-    return np.array([_rms(window) for window in shown]) / amplitudes
-
-
-def _rms(window: Floats) -> float:
-    _, model, left = window
-    inside = left[np.isfinite(model)]
-    return float(np.sqrt(np.mean(inside**2))) if inside.size else np.nan
-
-
-def residual_windows(tracks: xr.Dataset, summed: xr.Dataset, which: Iterable[int]) -> Iterator[Floats]:
-    """Yield what the fits on the summed image leave of the columns at the places ``which``, one by one.
-
-    Yields
-    ------
-    numpy.ndarray
-        (3, window, window): blurred image, model, and their difference, in counts a frame, NaN beyond the disc, and
-        everywhere where the column was not fitted in the summed image.
-    """
-    window, sigma = int(tracks.attrs["window_px"]), float(tracks.attrs["reference_blur_px"])
-    image = blur(summed["image"].to_numpy(), sigma)
-    parameters = tracks["fit_ref"].to_numpy().astype(np.float64)
-    parameters[:, [Y, X]] += summed.attrs.get("rounding_px", (0.0, 0.0))
-    half = window // 2
-    rows, columns = np.mgrid[-half : half + 1, -half : half + 1]
-    disc = rows**2 + columns**2 <= half**2
-    for own in parameters[list(which)]:
-        y, x = (round(own[Y]), round(own[X])) if np.isfinite(own).all() else (-1, -1)
-        if min(y, x) < half or y + half >= image.shape[0] or x + half >= image.shape[1]:
-            yield np.full((3, window, window), np.nan)
-            continue
-        data = image[y - half : y + half + 1, x - half : x + half + 1]
-        model = evaluate(own, columns + x, rows + y)
-        yield np.where(disc, np.stack([data, model, data - model]), np.nan)
 
 
 def _frames_a_bin(n_frames: int, n_columns: int, values: int) -> int:
