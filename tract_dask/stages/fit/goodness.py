@@ -9,6 +9,7 @@ added.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ class Freedom(NamedTuple):
     def median(self) -> float:
         """Median of the residual's sum of squares, in units of its mean (Wilson and Hilferty, 1931)."""
         k = max(self.skew_degrees, 0.5)
-        return 1 + k * ((1 - 2 / (9 * k)) ** 3 - 1) / np.sqrt(max(self.degrees, 0.5) * k)
+        return 1 + k * ((1 - 2 / (9 * k)) ** 3 - 1) / math.sqrt(max(self.degrees, 0.5) * k)
 
 
 def freedom(column: Floats, size: int, settings: FitSettings, shared: Floats | None = None) -> Freedom:

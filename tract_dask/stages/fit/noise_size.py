@@ -94,7 +94,7 @@ def window_noise(reference: Floats, size: int, settings: FitSettings, correlatio
 def _middle(reference: Floats) -> Floats:
     """Return the column of the median width."""
     width = reference[:, SIGMA_A] * reference[:, SIGMA_B]
-    return reference[np.argsort(width, kind="stable")[len(width) // 2]]
+    return np.asarray(reference[np.argsort(width, kind="stable")[len(width) // 2]])
 
 
 def _of_white(reference: Floats, size: int, settings: FitSettings) -> WindowNoise:
@@ -136,9 +136,7 @@ def _of_white(reference: Floats, size: int, settings: FitSettings) -> WindowNois
     return WindowNoise(errors[nearest], volume[nearest], left[nearest], free, level)
 
 
-def frame_noise(
-    ratio: Floats, good: NDArray[np.bool_], left: Floats, free: Freedom
-) -> tuple[Floats, NDArray[np.int64]]:
+def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, free: Freedom) -> tuple[Floats, Floats]:
     """Return the size of each frame's noise, (frames,), and how many windows tell it; NaN where they do not.
 
     Parameters
@@ -154,7 +152,7 @@ def frame_noise(
     """
     good = good & np.isfinite(ratio) & (left > 0)
     sizes = np.where(good, ratio / np.where(left > 0, left, 1.0), np.nan)
-    size, number = np.full(len(ratio), np.nan), good.sum(axis=1)
+    size, number = np.full(len(ratio), np.nan), good.sum(axis=1).astype(np.float64)
     enough = (number * free.degrees >= FEWEST_DEGREES) & (number > 0)
     if enough.any():
         size[enough] = np.nanmedian(sizes[enough], axis=1) / free.median
