@@ -105,7 +105,7 @@ def told(drifting, columns=None, drift=None, **settings):
 
 
 def test_a_smaller_window_reaches_closer_to_the_edge(drifting):
-    wide, narrow = (told(drifting, window_px=window) for window in (41, 19))
+    wide, narrow = (told(drifting, window_px=window) for window in (51, 19))
     assert "window-px" in wide["at_the_edge"].remedy
     assert "at_the_edge" not in narrow
 

@@ -14,10 +14,10 @@ from tract_dask.stages.fit.noise_size import FEWEST_DEGREES, frame_noise, window
 from tract_dask.store.columns import column_dataset
 
 PULL = 0.05
-"""Errors in units of the stated ones have a root mean square this near to 1, of 1500 fits."""
+"""Errors in units of the stated ones have a root mean square this near to 1, of 2000 fits."""
 
 UNIFORM = 0.06
-"""Largest distance of p-values' distribution from a uniform one, 1500 fits (their scatter alone makes 0.035)."""
+"""Largest distance of p-values' distribution from a uniform one, 2000 fits (their scatter alone makes 0.03)."""
 
 SIGMA = 0.15
 """Of a column, in units of the spacing."""
@@ -33,7 +33,7 @@ class Row(NamedTuple):
 
 
 def fitted(
-    row: Row, folder: Path, side: int = 5, fits: int = 1500, beside: dict[int, float] | None = None
+    row: Row, folder: Path, side: int = 5, fits: int = 2000, beside: dict[int, float] | None = None
 ) -> tuple[xr.Dataset, np.ndarray]:
     """Fit columns that jitter by 0.2 px by themselves; return the fits and where the columns are.
 

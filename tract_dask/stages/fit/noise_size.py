@@ -149,13 +149,18 @@ def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, free: Free
         (columns,) share of the noise that a fit leaves.
     free
         Degrees of freedom in a window.
+
+    Notes
+    -----
+    The median of n values of chi-squared over its k degrees of freedom is larger by 1 / (k n), in the mean, than that
+    of all.
     """
     good = good & np.isfinite(ratio) & (left > 0)
     sizes = np.where(good, ratio / np.where(left > 0, left, 1.0), np.nan)
     size, number = np.full(len(ratio), np.nan), good.sum(axis=1).astype(np.float64)
     enough = (number * free.degrees >= FEWEST_DEGREES) & (number > 0)
     if enough.any():
-        size[enough] = np.nanmedian(sizes[enough], axis=1) / free.median
+        size[enough] = np.nanmedian(sizes[enough], axis=1) / (free.median + 1 / (free.degrees * number[enough]))
     return size, number
 
 
