@@ -46,6 +46,12 @@ AS_THE_FILE_SAYS = MetadataSettings()
 
 _RAW = READERS[".raw"]
 
+_OPTIONS = {"dark": "--dark", "gain": "--gain-reference", "defects": "--defects"}
+"""What applies the references that lie beside a movie."""
+
+_NO_REFERENCE = (".xml", ".txt")
+"""Descriptions of cameras, which are no images and no lists of pixels."""
+
 
 def open_source(
     path: Path | str | FileList | Sequence[Path | str],
@@ -95,12 +101,19 @@ def open_source(
 
 
 def _not_applied(known: SourceMetadata) -> tuple[str, ...]:
-    """Return notes on the references of the detector that no note names yet."""
-    return tuple(
-        f"{file.name} next to the movie is by its name the detector's {kind} reference; it is not applied"
-        for kind, file in known.references.items()
-        if kind != "metadata" and not any(file.name in note for note in known.notes)
-    )
+    """Return notes on the references of the detector: those that no note names yet, and the options that apply them."""
+    notes = []
+    for kind, file in known.references.items():
+        outer, sign, inner = str(file).partition("::")
+        name = f"{Path(outer).name}{sign}{inner}"
+        applied = f"{_OPTIONS[kind]} {name}" if kind in _OPTIONS and file.suffix.lower() not in _NO_REFERENCE else ""
+        if kind != "metadata" and not any(file.name in note for note in known.notes):
+            without = f" without {applied}" if applied else ""
+            what = f"is by its name the detector's {kind} reference; it is not applied{without}"
+            notes.append(f"{name} next to the movie {what}")
+        elif applied:
+            notes.append(f"{applied} applies the detector's {kind} reference")
+    return tuple(notes)
 
 
 def open_cached(

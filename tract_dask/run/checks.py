@@ -18,6 +18,7 @@ from ..readers.source import FrameSource
 from ..settings.run import ColumnSettings, DriftSettings, FitSettings, RunSettings
 from ..stages.columns.sites import lattice_sites
 from ..stages.columns.window_size import resolve_window
+from ..stages.convert import references
 from ..stages.convert.origin import check_kept, is_movie_of, remembered_source
 from ..stages.drift.stage import read_drift_csv
 from ..stages.fit.job import check_counts
@@ -88,7 +89,7 @@ def check_pixels_of(movie: Movie, settings: FitSettings) -> None:
     SettingsError
         Where the estimator needs counts, and a pixel is negative.
     """
-    if settings.estimator == "poisson" and movie.offset == 0:
+    if settings.estimator == "poisson" and movie.offset == 0 and movie.pixels.dark is None:
         check_counts(movie.statistics()["frame_min"].to_numpy())
 
 
@@ -154,6 +155,7 @@ def with_whole_paths(settings: RunSettings) -> RunSettings:
 
     return dataclasses.replace(
         settings,
+        convert=references.with_whole_paths(settings.convert),
         drift=dataclasses.replace(settings.drift, csv=whole(settings.drift.csv)),
         columns=dataclasses.replace(settings.columns, csv=whole(settings.columns.csv)),
         cluster=dataclasses.replace(cluster, scheduler_file=whole(cluster.scheduler_file), tls=whole(cluster.tls)),

@@ -15,7 +15,9 @@ from ..errors import StoreError
 from ..readers import open_source
 from ..readers.source import SourceMetadata
 from ..readers.times import has_stamps
-from ..settings.run import RunSettings
+from ..settings.run import ConvertSettings, RunSettings
+from ..settings.toml import from_toml
+from ..stages.convert.references import given
 from ..store import datasets, metadata, schema
 from ..store.camera import Camera
 from ..store.movie import Movie, open_movie
@@ -91,12 +93,19 @@ def _movie(path: Path) -> dict[str, Any]:
         "dose, e/A^2": movie.dose,
         "gain": movie.gain,
         "offset, detector units": movie.offset,
+        **_references(path),
         "shards": len(movie.shards),
         "binned levels": list(movie.bins),
         **_left_out(movie),
         "frames with pixels that are missing": int(missing.sum()),
         "bad frames": int(bad.sum()),
     }
+
+
+def _references(path: Path) -> dict[str, str]:
+    """Return the references that a movie was corrected by."""
+    named = given(from_toml(ConvertSettings, metadata.attributes(path).get("settings", ""), str(path)))
+    return {name.replace("_", " "): place for name, place in named.items()}
 
 
 def _left_out(movie: Movie) -> dict[str, int]:

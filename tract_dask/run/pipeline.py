@@ -23,6 +23,7 @@ from ..settings.run import RunSettings
 from ..settings.toml import to_toml
 from ..stages.columns.stage import check_edited, clear_columns, columns_stage
 from ..stages.convert.origin import is_movie_of
+from ..stages.convert.references import check_references
 from ..stages.convert.stage import convert_stage
 from ..stages.drift.stage import drift_stage
 from ..stages.fit.stage import FitSummary, fit_stage
@@ -139,6 +140,7 @@ def run(
     opening = partial(open_input, source, settings, None if overwrite else outputs.movie, permit)
     with closing(attempt(opening)) as opened:
         attempt(partial(check_inputs, opened.shape, settings))
+        attempt(partial(check_references, opened, settings.convert, settings.metadata))
         if plan_only:
             plan = plan_run(opened.shape, opened.dtype, settings, expected_limit(settings, client))
             return RunOutcome(outputs, plan, RunState.PLANNED, plan.frames)

@@ -26,6 +26,7 @@ from ..run.plan import Plan, plan_run
 from ..settings.run import RunSettings, SourceSettings
 from ..settings.toml import from_dict
 from ..stages.convert.origin import origin_of
+from ..stages.convert.references import check_references
 from ..store.movie import open_movie
 from ..store.run_folder import RunFolder
 from .data_root import DataRoot
@@ -182,6 +183,7 @@ def check_source(place: str | FileList, stored: dict[str, Any], folder: Path | N
     settings = from_dict(RunSettings, stored)
     with closing(open_source(place, settings.source, settings.metadata, permit=permit)) as source:
         check_inputs(source.shape, settings)
+        check_references(source, settings.convert, settings.metadata)
         if folder is not None and folder.exists():
             check_output(RunFolder(folder), source, settings, overwrite=False)
         if _raw_bytes((1, *source.shape[1:]), source.dtype.name) <= _TRIED_BYTES:

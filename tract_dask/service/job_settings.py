@@ -13,6 +13,15 @@ from ..settings.run import RunSettings
 from ..settings.toml import from_dict, to_dict
 from .data_root import DataRoot
 
+_FILES = (
+    ("drift", "csv"),
+    ("columns", "csv"),
+    ("convert", "dark"),
+    ("convert", "gain_reference"),
+    ("convert", "defects"),
+)
+"""Group and name of the settings that are files."""
+
 
 def stored_settings(values: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that a user gives as a job keeps them: all of them, but for the cluster.
@@ -43,6 +52,18 @@ def inside(root: DataRoot, stored: dict[str, Any]) -> dict[str, Any]:
     OutsideError, MissingStoreError
         As :meth:`DataRoot.resolve`.
     """
-    tables = {group: stored.get(group, {}).get("csv") for group in ("drift", "columns")}
-    whole = {group: str(root.resolve(path)) for group, path in tables.items() if path is not None}
-    return stored | {group: stored[group] | {"csv": path} for group, path in whole.items()}
+    found = dict(stored)
+    for group, name in _FILES:
+        place = stored.get(group, {}).get(name)
+        if place is not None:
+            found[group] = found[group] | {name: _file(root, place)}
+    return found
+
+
+def _file(root: DataRoot, place: str) -> str:
+    """Return the whole path of a file or a store, with the path inside it after two colons."""
+    outer, sign, inner = place.partition("::")
+    whole = root.resolve(outer)
+    if whole.is_dir():
+        root.check_links(whole)
+    return f"{whole}{sign}{inner}"

@@ -80,6 +80,18 @@ class ConvertSettings(Settings):
     tile_px: int = setting(256, "Side of the tiles inside a shard", unit="px", low=16, high=8192)
     codec: str = setting("lz4", "Lossless compression: lz4 is fast, zstd is smaller", choices=("lz4", "zstd", "none"))
     find_defects: bool = setting(True, "Find hot and dead pixels, spikes, dead lines and borders, and leave them out")
+    dark: str | None = setting(None, "Image without electrons, or several: their mean is subtracted from every frame")
+    gain_reference: str | None = setting(
+        None, "Gain reference: every frame is multiplied by it, after the dark image is subtracted"
+    )
+    gain_reference_by: str = setting(
+        "multiply",
+        "Multiply frames by the gain reference, or divide them by it, as by the image of an even beam (a flat field)",
+        choices=("multiply", "divide"),
+    )
+    defects: str | None = setting(
+        None, "Faulty pixels, to be left out: a list of x, y (.csv, .txt), or an image that is 0 where pixels are good"
+    )
 
 
 @dataclass(frozen=True)

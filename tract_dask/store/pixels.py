@@ -1,9 +1,10 @@
-"""Which pixels of a movie carry no data, beside the frames in its store: a mask, spikes of single frames, borders.
+"""What is known of a movie's pixels, beside the frames in its store: which carry no data, and the references.
 
 Array ``0`` holds the frames as they were recorded. In the group ``pixels`` lie ``mask`` (y, x), why a pixel is left out
 of every frame; ``spikes`` (n, 3), frame, row and column of pixels that are left out of one frame; ``borders``
-(frames, 4), first and last row and column (not included) of what a frame shows. Only what there is is stored.
-A movie is read with NaN at these pixels.
+(frames, 4), first and last row and column (not included) of what a frame shows; ``dark`` and ``gain`` (y, x), what is
+subtracted from a pixel, and what it is multiplied by then. Only what there is is stored. A movie is read corrected,
+with NaN at the pixels that carry no data.
 """
 
 from __future__ import annotations
@@ -26,12 +27,18 @@ GROUP = "pixels"
 KINDS = {1: "hot", 2: "dead", 3: "lines", 4: "given"}
 """What the numbers of a mask mean; 0: the pixel is used."""
 
-_DIMENSIONS = {"mask": ("y", "x"), "spikes": ("spike", "place"), "borders": ("t", "edge")}
+_DIMENSIONS = {
+    "mask": ("y", "x"),
+    "spikes": ("spike", "place"),
+    "borders": ("t", "edge"),
+    "dark": ("y", "x"),
+    "gain": ("y", "x"),
+}
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """What is left out of the frames of a movie; None: nothing of that kind.
+    """What is left out of the frames of a movie, and corrects the others; None: nothing of that kind.
 
     Attributes
     ----------
@@ -41,11 +48,17 @@ class Pixels:
         (n, 3) int32 frame, y and x, by frame.
     borders
         (frames, 4) int32 first row, stop row, first column, stop column of what each frame shows.
+    dark
+        (y, x) float32, what is subtracted from every frame, in detector units.
+    gain
+        (y, x) float32, what frames are multiplied by then.
     """
 
     mask: NDArray[np.uint8] | None = None
     spikes: NDArray[np.int32] | None = None
     borders: NDArray[np.int32] | None = None
+    dark: NDArray[np.float32] | None = None
+    gain: NDArray[np.float32] | None = None
 
     def __bool__(self) -> bool:
         return any(getattr(self, field.name) is not None for field in fields(self))
@@ -63,7 +76,7 @@ class Pixels:
         return found
 
     def applied(self, block: NDArray[Any], first: int, top: int = 0, left: int = 0) -> NDArray[Any]:
-        """Return frames (frames, y, x) as real numbers, NaN where a pixel carries no data.
+        """Return frames (frames, y, x), corrected, as real numbers, NaN where a pixel carries no data.
 
         Parameters
         ----------
@@ -73,6 +86,11 @@ class Pixels:
         shown = block.astype(real_of(block.dtype))
         n, height, width = block.shape
         rows, columns = slice(top, top + height), slice(left, left + width)
+        for reference, correct in ((self.dark, np.subtract), (self.gain, np.multiply)):
+            if reference is not None:  # tiles at the edges may reach beyond the field
+                part = reference[rows, columns]
+                inside = shown[:, : part.shape[0], : part.shape[1]]
+                correct(inside, part, out=inside)
         if self.mask is not None and (masked := self.mask[rows, columns] > 0).any():
             shown[:, : masked.shape[0], : masked.shape[1]][:, masked] = np.nan
         if self.spikes is not None:
@@ -109,7 +127,7 @@ class Pixels:
 
 
 NO_PIXELS = Pixels()
-"""Of a movie in which every pixel carries data."""
+"""Of a movie in which every pixel carries data, and none is corrected."""
 
 
 def real_of(dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from ...kernels.borders import shown_part
 from ...kernels.defects import History, Moments, Noise, find_spikes, look_back
 from ...readers.source import FrameSource
+from ...settings.run import ConvertSettings
 from ...store.arrays import DamagedArrayError, load_saved, save_array
-from ...store.pixels import Pixels
+from ...store.pixels import NO_PIXELS, Pixels
+from .references import read_references
 
 _SAMPLE_FRAMES = 32
 FEWEST_FRAMES = 6
@@ -23,24 +25,44 @@ FEWEST_FRAMES = 6
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds what carries no data in a frame.
+    """Corrects frames, and finds what carries no data in them.
 
     Attributes
     ----------
     history
         What the sample of the movie told; None where it told nothing.
+    references
+        What corrects frames, and pixels that were given as faulty.
+    searches
+        Whether anything is looked for.
     """
 
     history: History | None
+    references: Pixels = NO_PIXELS
+    searches: bool = True
 
-    def look(self, frame: NDArray[Any]) -> Pixels:
-        """Return what is left out of a frame (y, x), as the first one of a movie."""
+    def corrected(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """Return a frame (y, x) by the references; the frame itself where there are none."""
+        return self.references.applied(frame[None], 0)[0] if self.references else frame
+
+    def look(self, frame: NDArray[Any], corrected: NDArray[Any]) -> Pixels:
+        """Return what is left out of a frame (y, x), as the first one of a movie, with what references say."""
+        if not self.searches:
+            return Pixels(self.mask)
         if self.history is None:
-            return Pixels(borders=_border(frame))
-        spikes = find_spikes(frame, self.history)
+            return Pixels(self.mask, borders=_border(frame))
+        spikes = find_spikes(corrected, self.history)
         placed = np.column_stack([np.zeros(len(spikes), np.int32), spikes]).astype(np.int32)
-        mask = self.history.mask if self.history.mask.any() else None
-        return Pixels(mask, placed if len(placed) else None, _border(frame))
+        return Pixels(self.mask, placed if len(placed) else None, _border(frame))
+
+    @cached_property
+    def mask(self) -> NDArray[np.uint8] | None:
+        """What is left out of all frames; None: nothing."""
+        found, named = self.history.mask if self.history else None, self.references.mask
+        either = [mask for mask in (found, named) if mask is not None and mask.any()]
+        if found is None or named is None or len(either) < 2:
+            return either[0] if either else None
+        return np.where(named > 0, named, found)
 
 
 def _border(frame: NDArray[Any]) -> NDArray[np.int32] | None:
@@ -48,15 +70,22 @@ def _border(frame: NDArray[Any]) -> NDArray[np.int32] | None:
     return None if shown is None else np.array([shown], np.int32)
 
 
-def finder_for(source: FrameSource, folder: Path) -> None:
-    """Look at a sample of a movie, and leave what it tells in ``folder``, for the tasks; once."""
+_REFERENCES = ("given", "dark", "gain")
+
+
+def finder_for(source: FrameSource, folder: Path, settings: ConvertSettings) -> None:
+    """Read the references, look at a sample of a movie, and leave both in ``folder``, for the tasks; once."""
     try:
         _load(folder)
     except DamagedArrayError:
-        history = _history(source)
+        references = read_references(source, settings)
+        for name, values in zip(_REFERENCES, (references.mask, references.dark, references.gain), strict=True):
+            save_array(folder / f"{name}.npy", np.empty((0, 0), np.float32) if values is None else values)
+        history = _history(source, Finder(None, references)) if settings.find_defects else None
         shape = source.shape[1:] if history else (0, 0)
         save_array(folder / "mask.npy", history.mask if history else np.zeros(shape, np.uint8))
         save_array(folder / "usual.npy", history.usual if history else np.zeros(shape, np.float32))
+        save_array(folder / "searches.npy", np.array(settings.find_defects))
         save_array(folder / "noise.npy", np.array(history.noise if history else (0.0, 0.0)))
 
 
@@ -67,12 +96,18 @@ def found_in(folder: Path) -> Finder:
 
 
 def _load(folder: Path) -> Finder:
-    mask, usual, noise = (load_saved(folder / f"{name}.npy") for name in ("mask", "usual", "noise"))
-    return Finder(History(mask, usual, Noise(*map(float, noise))) if mask.size else None)
+    mask, usual, noise, searches = (
+        load_saved(folder / f"{name}.npy") for name in ("mask", "usual", "noise", "searches")
+    )
+    named, dark, gain = (
+        values if values.size else None for values in (load_saved(folder / f"{name}.npy") for name in _REFERENCES)
+    )
+    history = History(mask, usual, Noise(*map(float, noise))) if mask.size else None
+    return Finder(history, Pixels(mask=named, dark=dark, gain=gain), bool(searches))
 
 
-def _history(source: FrameSource) -> History | None:
-    """Return what pairs of frames, spread over the movie, tell of its pixels."""
+def _history(source: FrameSource, finder: Finder) -> History | None:
+    """Return what pairs of frames, spread over the movie and corrected, tell of its pixels."""
     n_frames = source.shape[0]
     if n_frames < FEWEST_FRAMES:
         return None
@@ -82,7 +117,7 @@ def _history(source: FrameSource) -> History | None:
     for number, start in enumerate(starts):
         frames = source.read(start, start + (1 if whole else 2))
         for k, frame in enumerate(frames):
-            moments.add(frame, follows=k > 0 or (whole and number > 0))
+            moments.add(finder.corrected(frame), follows=k > 0 or (whole and number > 0))
     with np.errstate(invalid="ignore", over="ignore"):  # pixels that hold no number
         return look_back(moments)
 
@@ -111,11 +146,11 @@ class Gathered:
 
     def pixels(self, finder: Path | None) -> Pixels:
         """Return what is left out of the movie, with the mask that is in the finder's folder."""
-        history = found_in(finder).history if finder else None
-        mask = history.mask if history and history.mask.any() else None
+        known = found_in(finder) if finder else Finder(None)
         spikes = np.array(sorted(self._spikes), np.int32) if self._spikes else None
+        every = replace(known.references, mask=known.mask, spikes=spikes)
         if not self._borders:
-            return Pixels(mask, spikes)
+            return every
         borders = np.tile(self._whole, (self._n_frames, 1))
         borders[[int(number) for number in self._borders]] = list(self._borders.values())
-        return Pixels(mask, spikes, borders)
+        return replace(every, borders=borders)

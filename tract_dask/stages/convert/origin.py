@@ -19,6 +19,7 @@ from ...store.layout import plan_layout
 from ...store.movie import check_known
 from ...store.provenance import fingerprint
 from ...store.stamps import Stamps
+from . import references
 from .create import quantities
 
 DEFAULT_LAYOUT = ConvertSettings()
@@ -77,20 +78,31 @@ def movie_key(
     source_settings: SourceSettings = DECLARED_NOTHING,
 ) -> str:
     """Return the key of the movie that :func:`convert` makes; pixel size, times, dose and gain are not part of it."""
-    return stage_key(STAGE, origin_of(source).content, counted_of(settings, source_settings))
+    return stage_key(STAGE, origin_of(source).content, counted_of(source, settings, source_settings))
 
 
-def counted_of(settings: ConvertSettings, source_settings: SourceSettings) -> dict[str, Any]:
-    """Return the settings of a movie's key that differ from their defaults, by their names in keys."""
-    return counted(STAGE, convert=settings, source=source_settings)
+def counted_of(
+    source: FrameSource,
+    settings: ConvertSettings,
+    source_settings: SourceSettings,
+    remembered: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the settings of a movie's key that differ from their defaults, by their names in keys.
+
+    References count by what they hold. Where the source is gone, and they too, what is ``remembered`` of them does.
+    """
+    known = remembered if isinstance(source, GoneSource) else None
+    own = counted(STAGE, convert=settings, source=source_settings)
+    return own | references.contents(settings, source.permit, known)
 
 
-def made_of(origin: Origin, settings: ConvertSettings, source_settings: SourceSettings) -> dict[str, Any]:
+def made_of(source: FrameSource, settings: ConvertSettings, source_settings: SourceSettings) -> dict[str, Any]:
     """Return what a movie's key is made of, by which the movie is known again without its source."""
+    origin = origin_of(source)
     made = {
         "content": origin.content,
         "algorithm": ALGORITHMS[STAGE],
-        "settings": counted_of(settings, source_settings),
+        "settings": counted_of(source, settings, source_settings),
     }
     return {"made": made, "written": origin.stamps.written}
 
@@ -150,8 +162,9 @@ def _differences(
     present: dict[str, Any], source: FrameSource, settings: ConvertSettings, source_settings: SourceSettings
 ) -> list[str]:
     """Return in words how a complete movie differs from what would be made; nothing where it does not."""
-    made, now = present.get("made", {}), counted_of(settings, source_settings)
+    made = present.get("made", {})
     then = made.get("settings", {})
+    now = counted_of(source, settings, source_settings, then)
     layout = plan_layout(source.shape, source.dtype, settings)
     laid = [layout.frames_per_shard, list(layout.chunk)] == [present.get("frames_per_shard"), present.get("chunk")]
     found = [] if made.get("content") == origin_of(source).content else ["the source has other content"]

@@ -46,7 +46,7 @@ class Job:
     stamps: Stamps
     permit: Permit | None = None
     finder: Path | None = None
-    """Folder of what finds pixels without data; None: they are not looked for."""
+    """Folder of the references, and of what finds pixels without data; None: there is neither."""
 
 
 @lru_cache(maxsize=4)
@@ -65,8 +65,9 @@ def check_files(job: Job, source: FrameSource, shard: Shard) -> None:
 def convert_shard(job: Job, shard: Shard) -> Payload:
     """Read the frames of a shard, measure and bin them, write them; return their statistics.
 
-    Pixels without data are written as they were recorded; statistics and binned means leave them out. Beside the
-    statistics are the spikes of frames, ``spikes`` (n, 3) frame, y, x, and their ``borders``, by frame.
+    Pixels are written as they were recorded; statistics and binned means are of corrected ones, and leave out those
+    without data. Beside the statistics are the spikes of frames, ``spikes`` (n, 3) frame, y, x, and their ``borders``,
+    by frame.
     """
     source = _opened(job.source, job.source_settings, job.permit, job.stamps.digest)
     check = partial(check_files, job, source, shard)
@@ -87,9 +88,9 @@ def convert_shard(job: Job, shard: Shard) -> Payload:
     with files.disk_errors(job.path), ExitStack() as stack:
         writers = [stack.enter_context(_writer(job, factor, shard.index)) for factor in (1, *job.layout.bins)]
         for number, frame in enumerate(_read_ahead(source, shard, job.layout.chunk[0]), shard.start):
-            shown = frame
-            if finder and (odd := finder.look(frame)):
-                shown, left_out[number] = odd.applied(frame[None], 0)[0], odd
+            shown = finder.corrected(frame) if finder else frame
+            if finder and (odd := finder.look(frame, shown)):
+                shown, left_out[number] = odd.applied(shown[None], 0)[0], odd
             *measures, levels = meters[shown.dtype].measure(shown)
             for writer, pixels in zip(writers, (frame, *levels), strict=True):
                 writer.add(pixels)

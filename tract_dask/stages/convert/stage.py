@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,7 @@ from .origin import (
     origin_of,
     remembered,
 )
+from .references import applied_by, check_references, given, with_whole_paths
 from .shard import Job, convert_shard
 
 
@@ -105,8 +107,13 @@ def convert(
     movie = open_source(source, source_settings) if isinstance(source, str | Path) else source
     known = overridden(movie.metadata, metadata, source_settings)
     path = Path(destination).absolute()
+    settings = with_whole_paths(settings)
+    check_references(movie, settings, metadata)
+    if settings.dark is not None:
+        known = replace(known, offset=0.0)
     for note in known.notes:
-        on_event(Warned(note))
+        if not any(option in note for option in applied_by(settings)):  # it tells of what is applied now
+            on_event(Warned(note))
     n_frames, n_y, n_x = movie.shape
     announce = partial(StageStarted, STAGE, n_frames, frame_bytes=n_y * n_x * movie.dtype.itemsize)
 
@@ -174,11 +181,11 @@ def _write_shards(
 
 
 def _finder(source: FrameSource, settings: ConvertSettings, folder: Path) -> Path | None:
-    """Look for pixels without data in a sample of the movie; return the folder of what was found."""
-    if not settings.find_defects:
+    """Read references, look for pixels without data in a sample of the movie; return the folder of what was found."""
+    if not settings.find_defects and not given(settings):
         return None
     with disk_errors(folder):
-        finder_for(source, folder)
+        finder_for(source, folder, settings)
     return folder
 
 
@@ -198,7 +205,7 @@ def _begun(
     with disk_errors(path):
         if not same:
             _clear(path)
-            about = provenance(key, settings) | made_of(origin, settings, source_settings) | remembered(movie)
+            about = provenance(key, settings) | made_of(movie, settings, source_settings) | remembered(movie)
             about["source_settings"] = to_toml(source_settings)
             create(path, layout, settings.codec, about, known)
         return Journal(journal_beside(path), key, dict.fromkeys(schema.STATISTICS, (None,)))

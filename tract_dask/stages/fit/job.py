@@ -198,7 +198,7 @@ def prepare(
     statistics = movie.statistics()
     check_pixels(statistics, str(movie.path))
     camera = camera_of(movie, summed)
-    if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0:
+    if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0 and movie.pixels.dark is None:
         check_counts(statistics["frame_min"].to_numpy())
     measured = drift is not None and drift.attrs.get("method") != "none"
     return Job(

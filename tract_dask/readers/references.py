@@ -1,0 +1,178 @@
+"""References of a detector: images without electrons, gain references, and pixels that are known to be faulty."""
+
+from __future__ import annotations
+
+import os
+import re
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SourceError
+from ..store.files import read_small
+from ..store.provenance import fingerprint
+from ..store.tables import decoded
+from . import open_source
+from .checks import Permit, checked_file, reading
+from .selection import SelectedSource
+from .source import FrameSource
+
+Image = NDArray[np.float64]
+
+_LISTS = (".csv", ".txt", ".tsv")
+_LIST_BYTES = 64 << 20
+_BLOCK_BYTES = 64 << 20
+_MEANING = "Give one pixel in a line: x, y, counted from 0 in whole frames, as the file of the movie has them"
+
+
+def is_list(place: str) -> bool:
+    """Tell whether a reference is a list of pixels, by its name.
+
+    Examples
+    --------
+    >>> is_list("defects.csv"), is_list("mask.tif")
+    (True, False)
+    """
+    return Path(place).suffix.lower() in _LISTS
+
+
+def content_of_reference(place: str, permit: Permit | None = None) -> tuple[str, str]:
+    """Return what a reference holds, whatever its name: a fingerprint, and the path inside its file.
+
+    Raises
+    ------
+    SourceError
+        Where it cannot be read.
+    """
+    if is_list(place):
+        checked_file(Path(place), permit)
+        with reading(place):
+            return fingerprint(Path(place)), ""
+    with closing(open_source(place, permit=permit)) as image, reading(place):
+        return fingerprint(*image.files), image.inside
+
+
+def check_reference(place: str, movie: FrameSource) -> None:
+    """Check that a reference is there and fits the frames of a movie; its pixels are not read.
+
+    Raises
+    ------
+    SourceError
+        As :func:`read_reference`; only lists are read.
+    """
+    if is_list(place):
+        _listed(Path(place), _whole(movie).shape[1:], movie.permit)
+        return
+    with closing(open_source(place, permit=movie.permit)) as image:
+        _check_shape(place, image.shape, movie)
+
+
+def read_reference(place: str, movie: FrameSource) -> Image:
+    """Return the mean of the frames of an image, (y, x): of whole frames of the movie, or of the part that is read.
+
+    Raises
+    ------
+    SourceError
+        Where it is not there, cannot be read, or has another shape than the frames.
+    """
+    with closing(open_source(place, permit=movie.permit)) as image:
+        _check_shape(place, image.shape, movie)
+        n_frames, total = image.shape[0], np.zeros(image.shape[1:])
+        step = max(1, _BLOCK_BYTES // max(1, total.nbytes))
+        for start in range(0, n_frames, step):
+            total += image.read(start, min(n_frames, start + step)).sum(axis=0, dtype=np.float64)
+        return total / n_frames
+
+
+def read_defects(place: str, movie: FrameSource) -> NDArray[np.bool_]:
+    """Return which pixels are faulty, (y, x), of whole frames or of the part that is read: a list, or not 0 in a mask.
+
+    Raises
+    ------
+    SourceError
+        As :func:`read_reference`; where a line is no place in the frames; and where a mask has most pixels.
+    """
+    if is_list(place):
+        return _listed(Path(place), _whole(movie).shape[1:], movie.permit)
+    mask = read_reference(place, movie) != 0
+    if mask.mean() > 0.5:
+        raise SourceError(
+            "the mask leaves out most pixels",
+            place,
+            "0 where a pixel is good, another number where it is faulty",
+            f"{mask.mean():.0%} of the pixels are not 0",
+            "Save it the other way round",
+        )
+    return mask
+
+
+def in_part(image: NDArray[Any], movie: FrameSource) -> NDArray[Any]:
+    """Return what lies under each pixel of the part that is read, (y, x, pixels), of an image of frames or of the part.
+
+    Under a pixel lies one, or the bin that is summed.
+    """
+    if not isinstance(movie, SelectedSource) or image.shape == movie.shape[1:]:
+        return image[..., None]
+    (top, bottom, left, right), side = movie.field, movie.bin_px
+    cut = image[top:bottom, left:right]
+    rows, columns = movie.shape[1:]
+    return cut.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, side**2)
+
+
+def _whole(movie: FrameSource) -> FrameSource:
+    return movie.whole if isinstance(movie, SelectedSource) else movie
+
+
+def _check_shape(place: str, found: tuple[int, int, int], movie: FrameSource) -> None:
+    fitting = {_whole(movie).shape[1:]: "a frame of the movie", movie.shape[1:]: "the part of it that is read"}
+    if found[1:] not in fitting:
+        raise SourceError(
+            "the reference has another shape than the frames",
+            place,
+            " or ".join(f"{rows} x {columns} px, as {what} has" for (rows, columns), what in fitting.items()),
+            f"{found[1]} x {found[2]} px",
+            "Use the reference of this camera at this binning, cut to the field that was recorded",
+        )
+
+
+def _listed(path: Path, shape: tuple[int, ...], permit: Permit | None) -> NDArray[np.bool_]:
+    """Return the pixels of a list as a mask; its first line may name its columns, x and y among them."""
+    checked_file(path, permit)
+    try:
+        text = decoded(read_small(path, _LIST_BYTES))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(
+            "the list of pixels cannot be read", os.fspath(path), got=str(error), remedy=_MEANING
+        ) from error
+    mask, names = np.zeros(shape, bool), ("x", "y")
+    first = True
+    for number, line in enumerate(text.splitlines(), 1):
+        words = tuple(re.split(r"\s*[,;\s]\s*", line.strip().lower()))
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if first and {"x", "y"} <= set(words):
+            names = words
+        else:
+            x, y = _place(dict(zip(names, words, strict=False)), words, shape, f"{path}, line {number}")
+            mask[y, x] = True
+        first = False
+    return mask
+
+
+def _place(row: dict[str, str], words: tuple[str, ...], shape: tuple[int, ...], where: str) -> tuple[int, int]:
+    try:
+        x, y = float(row["x"]), float(row["y"])
+    except (KeyError, ValueError):
+        raise SourceError("this is not a pixel", where, "two whole numbers", " ".join(words)[:80], _MEANING) from None
+    if not (x.is_integer() and y.is_integer() and 0 <= x < shape[1] and 0 <= y < shape[0]):
+        raise SourceError(
+            "there is no such pixel in the frames",
+            where,
+            f"x from 0 to {shape[1] - 1}, y from 0 to {shape[0] - 1}",
+            f"{row['x']}, {row['y']}",
+            _MEANING,
+        )
+    return int(x), int(y)

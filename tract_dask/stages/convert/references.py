@@ -1,0 +1,141 @@
+"""What the references of a detector make of recorded pixels: (pixel - dark) / sensitivity, and faulty ones left out.
+
+A gain reference that is multiplied holds 1 / sensitivity, one that is divided (a flat field) the sensitivity itself.
+Both are scaled so that the mean sensitivity is 1: frames that are lit evenly keep their mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import MissingSourceError, SettingsError, SourceError
+from ...kernels.defects import USER
+from ...readers.checks import Permit
+from ...readers.references import (
+    check_reference,
+    content_of_reference,
+    in_part,
+    read_defects,
+    read_reference,
+)
+from ...readers.source import FrameSource
+from ...settings.declare import option
+from ...settings.run import ConvertSettings, MetadataSettings
+from ...store.keys import digest_of
+from ...store.pixels import NO_PIXELS, Pixels
+
+NAMES = ("dark", "gain_reference", "defects")
+"""The settings that name references."""
+
+_UNLIKE = 4.0
+"""A pixel whose sensitivity differs so many times from the usual one is faulty."""
+
+
+def given(settings: ConvertSettings) -> dict[str, str]:
+    """Return where the references are that the settings name, by the settings' names."""
+    named = {name: getattr(settings, name) for name in NAMES}
+    return {name: place for name, place in named.items() if place is not None}
+
+
+def applied_by(settings: ConvertSettings) -> list[str]:
+    """Return the options of the references that are given."""
+    return [option("convert", field) for field in fields(settings) if field.name in given(settings)]
+
+
+def with_whole_paths(settings: ConvertSettings) -> ConvertSettings:
+    """Return the settings with whole paths of the references, so that they mean the same from any folder."""
+    return replace(settings, **{name: str(Path(place).absolute()) for name, place in given(settings).items()})
+
+
+def contents(
+    settings: ConvertSettings, permit: Permit | None = None, remembered: dict[str, Any] | None = None
+) -> dict[str, str]:
+    """Return what the references hold, by the names in keys; where one is gone, what is ``remembered`` of it.
+
+    Raises
+    ------
+    SourceError
+        Where one cannot be read.
+    """
+    found = {}
+    for name, place in given(settings).items():
+        try:
+            found[f"convert.{name}"] = digest_of(*content_of_reference(place, permit))
+        except MissingSourceError:
+            if not (remembered or {}).get(f"convert.{name}"):
+                raise
+            found[f"convert.{name}"] = str((remembered or {})[f"convert.{name}"])
+    return found
+
+
+def check_references(movie: FrameSource, settings: ConvertSettings, metadata: MetadataSettings) -> None:
+    """Check that references are there and fit the frames of a source that is there, before any work.
+
+    Raises
+    ------
+    SourceError
+        Where one does not.
+    SettingsError
+        Where an offset is to be subtracted as well as a dark image, which holds it.
+    """
+    for place in given(settings).values() if movie.files else ():
+        check_reference(place, movie)
+    if settings.dark is not None and not isinstance(metadata.offset, str) and metadata.offset != 0:
+        raise SettingsError(
+            "the dark image holds the offset already",
+            "setting offset (MetadataSettings)",
+            "0 or auto with a dark image",
+            f"{metadata.offset:g}",
+            "Leave out --offset, or --dark",
+        )
+
+
+def read_references(movie: FrameSource, settings: ConvertSettings) -> Pixels:
+    """Return what corrects the frames of a movie, as its store keeps it: ``dark``, ``gain`` and a ``mask``.
+
+    Raises
+    ------
+    SourceError
+        Where a reference cannot be read, has another shape, or holds nothing that corrects a pixel.
+    """
+    if not given(settings):
+        return NO_PIXELS
+    faulty = np.zeros(movie.shape[1:], bool)
+    dark = gain = None
+    if settings.defects is not None:
+        faulty |= in_part(read_defects(settings.defects, movie), movie).any(axis=2)
+    if settings.dark is not None:
+        level = in_part(read_reference(settings.dark, movie), movie).sum(axis=2)
+        faulty |= ~np.isfinite(level)
+        dark = np.where(np.isfinite(level), level, 0).astype(np.float32)
+    if settings.gain_reference is not None:
+        image = read_reference(settings.gain_reference, movie)
+        found = in_part(_sensitivity(image, settings.gain_reference, settings.gain_reference_by), movie)
+        faulty |= np.isnan(found).any(axis=2)
+        gain = np.where(faulty, 1, 1 / np.where(faulty, 1, found.mean(axis=2))).astype(np.float32)
+    mask = np.where(faulty, np.uint8(USER), np.uint8(0)) if faulty.any() else None
+    return Pixels(mask=mask, dark=dark, gain=gain)
+
+
+def _sensitivity(image: NDArray[np.float64], place: str, by: str) -> NDArray[np.float64]:
+    """Return the sensitivity of pixels, of mean 1; NaN where a pixel has none, or one that is out of all proportion."""
+    good = np.isfinite(image) & (image > 0)
+    if good.mean() < 0.5:
+        raise SourceError(
+            "most pixels of the gain reference are not above 0",
+            place,
+            "numbers about 1, or about the level of an even image",
+            f"{1 - good.mean():.0%} of the pixels at 0, below, or no numbers",
+            "Give the gain reference itself; subtract a dark image from a flat field before it is saved",
+        )
+    values = np.where(good, image, np.nan)
+    found = values if by == "divide" else 1 / values
+    usual = np.nanmedian(found)
+    found[(found > _UNLIKE * usual) | (found < usual / _UNLIKE)] = np.nan
+    normal: NDArray[np.float64] = found / np.nanmean(found)
+    return normal
