@@ -147,7 +147,8 @@ def _listed(path: Path, shape: tuple[int, ...], permit: Permit | None) -> NDArra
         raise SourceError(
             "the list of pixels cannot be read", os.fspath(path), got=str(error), remedy=_MEANING
         ) from error
-    mask, names = np.zeros(shape, bool), ("x", "y")
+    mask = np.zeros(shape, bool)
+    names: tuple[str, ...] = ("x", "y")
     first = True
     for number, line in enumerate(text.splitlines(), 1):
         words = tuple(re.split(r"\s*[,;\s]\s*", line.strip().lower()))

@@ -49,7 +49,8 @@ def applied_by(settings: ConvertSettings) -> list[str]:
 
 def with_whole_paths(settings: ConvertSettings) -> ConvertSettings:
     """Return the settings with whole paths of the references, so that they mean the same from any folder."""
-    return replace(settings, **{name: str(Path(place).absolute()) for name, place in given(settings).items()})
+    whole: dict[str, Any] = {name: str(Path(place).absolute()) for name, place in given(settings).items()}
+    return replace(settings, **whole)
 
 
 def contents(
