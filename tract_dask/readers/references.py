@@ -97,7 +97,7 @@ def read_defects(place: str, movie: FrameSource) -> NDArray[np.bool_]:
     """
     if is_list(place):
         return _listed(Path(place), _whole(movie).shape[1:], movie.permit)
-    mask = read_reference(place, movie) != 0
+    mask: NDArray[np.bool_] = read_reference(place, movie) != 0
     if mask.mean() > 0.5:
         raise SourceError(
             "the mask leaves out most pixels",
