@@ -105,15 +105,12 @@ def convert(
     """
     started = time.perf_counter()
     movie = open_source(source, source_settings) if isinstance(source, str | Path) else source
-    known = overridden(movie.metadata, metadata, source_settings)
     path = Path(destination).absolute()
     settings = with_whole_paths(settings)
     check_references(movie, settings, metadata)
-    if settings.dark is not None:
-        known = replace(known, offset=0.0)
+    known = _known(movie, settings, source_settings, metadata)
     for note in known.notes:
-        if not any(option in note for option in applied_by(settings)):  # it tells of what is applied now
-            on_event(Warned(note))
+        on_event(Warned(note))
     n_frames, n_y, n_x = movie.shape
     announce = partial(StageStarted, STAGE, n_frames, frame_bytes=n_y * n_x * movie.dtype.itemsize)
 
@@ -141,6 +138,16 @@ def convert(
     summary = ", ".join([f"{n_frames} frames in {len(shards)} shards", *in_words(pixels.counts((n_y, n_x)))])
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=summary))
     return path
+
+
+def _known(
+    movie: FrameSource, settings: ConvertSettings, source_settings: SourceSettings, metadata: MetadataSettings
+) -> SourceMetadata:
+    """Return what is known of a movie once its references are applied: notes do not ask for them any more."""
+    known = overridden(movie.metadata, metadata, source_settings)
+    options = applied_by(settings)
+    notes = tuple(note for note in known.notes if not any(option in note for option in options))
+    return replace(known, notes=notes, offset=known.offset if settings.dark is None else 0.0)
 
 
 def _to_measure(metadata: MetadataSettings) -> list[str]:
