@@ -107,10 +107,7 @@ def convert(
     movie = open_source(source, source_settings) if isinstance(source, str | Path) else source
     path = Path(destination).absolute()
     settings = with_whole_paths(settings)
-    check_references(movie, settings, metadata)
-    known = _known(movie, settings, source_settings, metadata)
-    for note in known.notes:
-        on_event(Warned(note))
+    known = _known(movie, settings, source_settings, metadata, on_event)
     n_frames, n_y, n_x = movie.shape
     announce = partial(StageStarted, STAGE, n_frames, frame_bytes=n_y * n_x * movie.dtype.itemsize)
 
@@ -141,13 +138,20 @@ def convert(
 
 
 def _known(
-    movie: FrameSource, settings: ConvertSettings, source_settings: SourceSettings, metadata: MetadataSettings
+    movie: FrameSource,
+    settings: ConvertSettings,
+    source_settings: SourceSettings,
+    metadata: MetadataSettings,
+    on_event: Sink,
 ) -> SourceMetadata:
-    """Return what is known of a movie once its references are applied: notes do not ask for them any more."""
+    """Check the references; return what is known of a movie once they are applied, and tell its notes but for these."""
+    check_references(movie, settings, metadata)
     known = overridden(movie.metadata, metadata, source_settings)
     options = applied_by(settings)
-    notes = tuple(note for note in known.notes if not any(option in note for option in options))
-    return replace(known, notes=notes, offset=known.offset if settings.dark is None else 0.0)
+    for note in known.notes:
+        if not any(option in note for option in options):
+            on_event(Warned(note))
+    return known if settings.dark is None else replace(known, offset=0.0)
 
 
 def _to_measure(metadata: MetadataSettings) -> list[str]:
