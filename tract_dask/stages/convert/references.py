@@ -16,18 +16,12 @@ from numpy.typing import NDArray
 from ...errors import MissingSourceError, SettingsError, SourceError
 from ...kernels.defects import USER
 from ...readers.checks import Permit
-from ...readers.references import (
-    check_reference,
-    content_of_reference,
-    in_part,
-    read_defects,
-    read_reference,
-)
 from ...readers.source import FrameSource
 from ...settings.declare import option
 from ...settings.run import ConvertSettings, MetadataSettings
 from ...store.keys import digest_of
 from ...store.pixels import NO_PIXELS, Pixels
+from .reference_files import check_reference, content_of_reference, in_part, read_defects, read_reference
 
 NAMES = ("dark", "gain_reference", "defects")
 """The settings that name references."""

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError
-from ..store.files import read_small
-from ..store.provenance import fingerprint
-from ..store.tables import decoded
-from . import open_source
-from .checks import Permit, checked_file, reading
-from .selection import SelectedSource
-from .source import FrameSource
+from ...errors import SourceError
+from ...readers import open_source
+from ...readers.checks import Permit, checked_file, reading
+from ...readers.selection import SelectedSource
+from ...readers.source import FrameSource
+from ...store.files import read_small
+from ...store.provenance import fingerprint
+from ...store.tables import decoded
 
 Image = NDArray[np.float64]
 
