@@ -280,6 +280,9 @@ def test_too_many_large_windows_are_refused_at_once(scene: column_editing.Scene)
     y, x = np.indices(SHAPE).reshape(2, -1)[:, ::7]
     with pytest.raises(SettingsError, match="windows of 51 px"):
         refine(scene, edited_columns(np.stack([x, y], 1), [""] * len(x), [None] * len(x), SHAPE), 100.0)
+    twice = np.repeat(np.stack([x, y], 1), 2, axis=0)
+    with pytest.raises(SettingsError, match="most of these columns have the same place"):
+        refine(scene, edited_columns(twice, [""] * len(twice), [None] * len(twice), SHAPE))
 
 
 def test_what_leaves_the_image_is_told(scene: column_editing.Scene) -> None:

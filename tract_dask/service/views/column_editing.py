@@ -260,15 +260,15 @@ def edited_columns(
 
 def _check_apart(xy: NDArray[np.float64], where: str) -> None:
     """Check that no pixel has more columns than can be meant."""
-    pixels, first, number = np.unique(np.rint(xy), axis=0, return_index=True, return_counts=True)
-    most = int(number.argmax())
-    if number[most] > _MOST_ON_A_PIXEL:
-        x, y = pixels[most]
+    x, y = np.rint(xy).astype(np.int64).T
+    _, firsts, numbers = np.unique(y * (x.max() + 1) + x, return_index=True, return_counts=True)
+    number, first = numbers.max(), firsts[numbers.argmax()]
+    if number > _MOST_ON_A_PIXEL:
         raise SettingsError(
             "many columns have the same place",
-            f"{where}, column {first[most] + 1}",
+            f"{where}, column {first + 1}",
             f"at most {_MOST_ON_A_PIXEL} columns on a pixel",
-            f"{number[most]} on the pixel at x {x:.0f}, y {y:.0f}",
+            f"{number} on the pixel at x {x[first]}, y {y[first]}",
             "Keep one of them",
         )
 
@@ -329,14 +329,24 @@ def refine(scene: Scene, columns: xr.Dataset, spacing_px: float | None = None) -
 def _check_windows(columns: xr.Dataset, window_px: int | None, spacing_px: float | None, image_px: int) -> None:
     """Check that the windows of many columns can be fitted while somebody waits."""
     number = columns.sizes["column_id"]
+    if number <= _FEW:
+        return
     spacing = spacing_px or neighbour_distance(positions(columns))
-    side = window_px or (default_window(spacing) if spacing else 0)
-    most = min(_MOST_COVER * image_px, _MOST_WINDOW_PX) // max(side, 1) ** 2
-    if number > max(_FEW, most):
+    if not spacing:
+        raise SettingsError(
+            "most of these columns have the same place as another one",
+            "columns",
+            "each column once",
+            f"{number} columns",
+            "Keep one of those at the same place",
+        )
+    side = window_px or default_window(spacing)
+    most = max(_FEW, min(_MOST_COVER * image_px, _MOST_WINDOW_PX) // side**2)
+    if number > most:
         raise SettingsError(
             "the windows of these columns are too large to refine so many at once",
             "columns",
-            f"at most {max(_FEW, most)} columns with windows of {side} px",
+            f"at most {most} columns with windows of {side} px",
             str(number),
             "Refine fewer columns at a time; or check spacing_px",
         )

@@ -16,11 +16,14 @@ def neighbour_distance(places: NDArray[np.float64]) -> float | None:
         return None
     from scipy.spatial import cKDTree  # takes its time, and workers do not need it
 
-    apart, back, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
-    nearest = np.zeros(len(apart))  # of a tree, all places that are the same one would be compared with each other
+    # A tree compares all places that are the same one with each other; as complex numbers they are sorted fast.
+    pairs = np.ascontiguousarray(places, np.float64).view(np.complex128).ravel()
+    found, back, count = np.unique(pairs, return_inverse=True, return_counts=True)
+    apart = found.view(np.float64).reshape(-1, 2)
+    nearest = np.zeros(len(apart))
     if len(apart) > 1:
         nearest[count == 1] = np.asarray(cKDTree(apart).query(apart[count == 1], k=2)[0]).reshape(-1, 2)[:, 1]
-    return float(np.median(nearest[back.ravel()])) or None
+    return float(np.median(nearest[back])) or None
 
 
 def default_window(spacing_px: float) -> int:
