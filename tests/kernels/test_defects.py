@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tract_dask.kernels.borders import shown_part
-from tract_dask.kernels.defects import DEAD, HOT, LINE, Moments, find_spikes, look_back
+from tract_dask.kernels.defects import DEAD, HOT, LINE, Moments, find_spikes, look_at_few, look_back
 
 SHAPE, FRAMES = (120, 132), 32
 
@@ -110,9 +110,55 @@ def test_empty_rows_at_a_low_dose_are_no_border():
     assert shown_part(frame) is None
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_vacuum_without_noise_is_no_border(whole):
+    """A simulation's vacuum has one value; so has that of a counting camera where no electron came."""
+    y, x = (
+        np.exp(-0.5 * ((np.arange(side)[:, None] - np.arange(first, side, 24)) / 4) ** 2).sum(axis=1)
+        for side, first in zip(SHAPE, (52, 12), strict=True)
+    )
+    level = np.outer(y, x)
+    assert shown_part(np.rint(20 + 60 * level) if whole else (20 + 60 * level).astype(np.float32)) is None
+    assert shown_part(np.random.default_rng(0).poisson(30 * level)) is None
+
+
+def test_a_border_is_found_beside_vacuum_of_few_counts():
+    frame = np.random.default_rng(1).poisson(columns(4.0, 3.0, 0.15)[0])
+    frame[:, :9] = 0
+    assert shown_part(frame)[2] in (9, 10, 11)
+
+
 def test_a_frame_of_one_value_has_no_border():
     assert shown_part(np.zeros(SHAPE, np.uint8)) is None
     assert shown_part(np.full(SHAPE, np.nan)) is None
+
+
+@pytest.mark.parametrize("n_frames", [1, 2, 5])
+@pytest.mark.parametrize(("amplitude", "background", "height"), [(1.44, 3.2, 200), (300, 100, 5000), (0.2, 0.05, 40)])
+def test_few_frames_show_what_is_higher_than_its_neighbours(n_frames, amplitude, background, height):
+    rng = np.random.default_rng(8)
+    frames = rng.poisson(columns(4.0, amplitude, background)[:n_frames])
+    hot, spikes = faulty(rng, 12), np.stack([faulty(rng, 5) for _ in frames])
+    frames[:, hot] = height
+    frames[spikes] = height
+    history = look_at_few(frames)
+    if n_frames > 1:
+        np.testing.assert_array_equal(history.mask > 0, hot)
+    seen = np.zeros(frames.shape, bool)
+    for frame, each in zip(frames, seen, strict=True):
+        each[tuple(find_spikes(frame, history).T)] = True
+    assert not (seen & ~(spikes | hot)).any()
+    assert (seen | (history.mask > 0))[spikes | hot].mean() > 0.9
+
+
+@pytest.mark.parametrize("sigma", [0.8, 5.0])
+@pytest.mark.parametrize(("amplitude", "background"), [(1e4, 0.0), (100, 10), (3, 3), (0.2, 0.05), (-90, 100)])
+def test_few_frames_show_columns_and_no_defects(sigma, amplitude, background):
+    expected = np.clip(columns(sigma, amplitude, background)[:2], 0, None)
+    for frames in (np.random.default_rng(9).poisson(expected), np.random.default_rng(9).poisson(expected)[:1]):
+        history = look_at_few(frames)
+        assert not history.mask.any()
+        assert sum(len(find_spikes(frame, history)) for frame in frames) == 0
 
 
 def test_frames_without_noise_have_no_defects():

@@ -313,6 +313,16 @@ def test_warnings_are_where_they_belong(run, change, expected):
     assert run.names() == expected
 
 
+def test_saturated_pixels_and_vacuum_without_noise_are_named(run, npy):
+    convert(npy(np.minimum(run.scene.counts(), 50)), run.folder / "movie.zarr")
+    run.about |= {"vacuum_unusable": "60% of its pixels have the lowest value, 0: what was below was cut off"}
+    found = {finding.name: finding for finding in findings(survey(run.write(), []))}
+    assert {"saturated", "vacuum"} <= found.keys()
+    assert "50 detector units" in found["saturated"].text
+    assert found["saturated"].serious
+    assert found["vacuum"].serious
+
+
 @pytest.mark.usefixtures("no_pictures")
 def test_pixels_without_data_are_counted_and_drawn(run, npy):
     frames = run.scene.counts()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
 from tract_dask.stages.fit.frame_fits import FrameFits
 from tract_dask.stages.fit.job import Job, prepare
 from tract_dask.stages.fit.measure import measure
-from tract_dask.stages.fit.vacuum import find_vacuum
+from tract_dask.stages.fit.vacuum import find_vacuum, why_unusable
 from tract_dask.store.schema import Status
 from tract_dask.store.shards import Shard
 
@@ -243,6 +244,27 @@ def test_vacuum_without_noise_is_vacuum(scene):
     summed["image"][:64] = summed["image"][:24].mean()  # no edge
     y0, y1, x0, x1 = find_vacuum(summed, scene.columns(), 2.0)
     assert summed["image"][y0:y1, x0:x1].std() == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [("one value", "the value 7"), ("cut off", "was cut off"), ("hardly any", "counts a frame"), ("none", "no data")]
+    + [(kind, None) for kind in ("counts", "low dose", "camera")],
+)
+def test_vacuum_that_does_not_tell_the_noise_is_not_used(kind, said):
+    rng, shape = np.random.default_rng(1), (6, 60, 70)
+    frames = {
+        "one value": np.full(shape, 7.0),
+        "cut off": np.maximum(rng.normal(0, 9, shape), 0),
+        "hardly any": rng.poisson(1e-3, shape),
+        "none": np.full(shape, np.nan),
+        "counts": rng.poisson(20, shape),
+        "low dose": rng.poisson(0.05, shape),
+        "camera": np.rint(7.3 * rng.poisson(20, shape) + rng.normal(100, 5, shape)),
+    }[kind]
+    movie = SimpleNamespace(read=lambda start, stop, rows, columns: frames[start:stop, rows, columns])
+    why = why_unusable(movie, (4, 40, 10, 60), np.full((6, 2), 1.6), np.ones(6, bool))
+    assert said in why if said else why is None
 
 
 def test_a_field_without_vacuum_takes_its_noise_from_the_residuals(scene, make_movie):

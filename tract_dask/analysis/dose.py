@@ -120,6 +120,11 @@ class SummedFrames(Movie):
         return partial(SummedFrames, **{item.name: getattr(self, item.name) for item in fields(self)}), ()
 
     @property
+    def full_scale(self) -> None:
+        """None: a sum in which a frame is saturated is infinite, and has no limit that is known."""
+        return
+
+    @property
     def n_dropped(self) -> int:
         """Number of frames at the end of the source that are in no sum."""
         return self.source.n_frames - self.n * self.n_frames

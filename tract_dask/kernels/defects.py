@@ -13,11 +13,14 @@ through the variance from one frame to the next against the level.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from .saturation import full_scale
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.uint8]
@@ -110,11 +113,17 @@ class History(NamedTuple):
         (blocks, blocks) no pixel at or below this is looked at more closely: levels in the sample, and noise.
     noise
         Of one frame.
+    full_scale
+        Value at which pixels are cut off; None where they are not.
+    relief
+        How many standard deviations are taken off h - l in single frames.
     """
 
     mask: Mask
     usual: Floats
     noise: Noise
+    full_scale: float | None = None
+    relief: float = _RELIEF
 
 
 def look_back(moments: Moments) -> History | None:
@@ -128,14 +137,42 @@ def look_back(moments: Moments) -> History | None:
     odd = ~np.isfinite(mean)
     known = np.where(odd | (mask > 0), np.float32(np.nan), mean)
     high, low = (_standing_out(known, np.float32(sign), noise, moments.frames) for sign in (1, -1))
-    stuck = _stuck(moments.changes, moments.pairs, mask > 0)
     mask[(mask == 0) & (high > 0)] = HOT
+    top = full_scale(moments.second, moments.last, (mask == 0) & ~odd)
+    stuck = _stuck(moments.changes, moments.pairs, (mask > 0) | (moments.second == (np.nan if top is None else top)))
     mask[(mask == 0) & ((low > 0) | (stuck > 0)) & ~odd] = DEAD
-    level = _blocks(np.where(mask > 0, np.float32(np.nan), mean))
-    high_level = _largest_around(np.where(np.isfinite(level), level, -np.inf))
-    spread = np.sqrt(np.maximum(noise.even + noise.slope * np.maximum(high_level, 0), 0))
-    usual = high_level + _FRAME_NOISE * (spread + noise.slope)
-    return History(mask, np.where(np.isfinite(usual), usual, 0).astype(np.float32), noise)
+    return History(mask, _usual(np.where(mask > 0, np.float32(np.nan), mean), noise), noise, top)
+
+
+def look_at_few(frames: Sequence[NDArray[Any]]) -> History | None:
+    """Return the same for a movie of a few frames (y, x), by neighbours alone; None where nothing varies.
+
+    As there are no levels of a sample that narrow columns stay below, h - l is taken as it is.
+
+    Pixels that stand out in all frames are hot ones, if there are two or more.
+    """
+    moments = Moments(frames[0].shape)
+    for number, frame in enumerate(frames):
+        moments.add(frame, follows=number > 0)
+    mean = moments.total / np.float32(moments.frames)
+    across: Floats = np.diff(mean, axis=1, append=mean[:, -1:]) ** np.float32(2) / np.float32(2)
+    if (noise := _noise(mean, moments.variance if moments.pairs else across)) is None:
+        return None
+    history = History(np.zeros(mean.shape, np.uint8), _usual(mean, noise), noise, relief=0.0)
+    found = np.zeros(mean.shape, np.int64)
+    for frame in frames:
+        found[tuple(find_spikes(frame, history).T)] += 1
+    history.mask[(found == len(frames)) & (found > 1)] = HOT
+    top = full_scale(moments.first, moments.last, (found == 0) & np.isfinite(mean))
+    return history._replace(usual=_usual(np.where(found > 0, np.float32(np.nan), mean), noise), full_scale=top)
+
+
+def _usual(level: Floats, noise: Noise) -> Floats:
+    """Return the level of blocks beyond which a pixel of a frame is looked at, from the mean of frames (y, x)."""
+    blocks = _blocks(level)
+    high = _largest_around(np.where(np.isfinite(blocks), blocks, -np.inf))
+    usual = high + _FRAME_NOISE * (np.sqrt(np.maximum(noise.even + noise.slope * np.maximum(high, 0), 0)) + noise.slope)
+    return np.where(np.isfinite(usual), usual, 0).astype(np.float32)
 
 
 def _standing_out(known: Floats, sign: np.float32, noise: Noise, frames: int) -> Mask:
@@ -283,13 +320,16 @@ def find_spikes(frame: NDArray[Any], history: History) -> NDArray[np.int64]:
     A frame in which more than 3 of 1000 pixels do is another picture, and has no spikes.
     """
     room = np.empty((max(16, frame.size // 333), 2), np.int64)
-    n = _spikes(frame, history.mask, history.usual, history.noise.even, history.noise.slope, room)
+    n = _spikes(frame, history.mask, history.usual, (*history.noise, history.relief), room)
     return room[:n] if n < len(room) else room[:0]
 
 
 @njit(cache=True, nogil=True)
-def _spikes(frame: NDArray[Any], mask: Mask, usual: Floats, even: float, slope: float, out: NDArray[np.int64]) -> int:
+def _spikes(
+    frame: NDArray[Any], mask: Mask, usual: Floats, limits: tuple[float, float, float], out: NDArray[np.int64]
+) -> int:
     n, width, room = 0, frame.shape[1], np.empty(25)
+    even, slope, relief = limits
     limit = np.empty(usual.shape[1] * BLOCK, np.float32)
     for y in range(frame.shape[0]):
         if y % BLOCK == 0:
@@ -309,7 +349,7 @@ def _spikes(frame: NDArray[Any], mask: Mask, usual: Floats, even: float, slope: 
             count, high, low = _bounds_around(frame, y, x, room)
             noise = np.sqrt(even + slope * max(0.0, high))
             if count and value > (
-                high + _STRUCTURE * max(0.0, high - low - _RELIEF * noise) + _FRAME_NOISE * (noise + slope)
+                high + _STRUCTURE * max(0.0, high - low - relief * noise) + _FRAME_NOISE * (noise + slope)
             ):
                 if n == out.shape[0]:
                     return n

@@ -166,6 +166,19 @@ def _pixels(run: Survey) -> Iterator[Finding]:
         text = f"{masked:,} pixels ({masked / size:.1%}) are left out of all frames: {', '.join(kinds)}."
         remedy = "Look at the mask, below. Where it is wrong, run again with --set convert.find_defects=false."
         yield Finding("masked_pixels", "Many pixels carry no data", text, remedy)
+    if saturated := counts.get("saturated"):
+        frames = counts["frames with saturated pixels"]
+        text = (
+            f"{count(saturated, 'pixel')} in {count(frames, 'frame')} have the largest value there is, "
+            f"{counts['full scale']:g} detector units: what was above is cut off. Fits take them as at least so high; "
+            "the errors in these windows are wider."
+        )
+        remedy = "Record with less beam or shorter frames. Was the file stretched to 8 bits, convert the original."
+        yield Finding("saturated", "Pixels are saturated", text, remedy)
+    if why := run.about.get("vacuum_unusable"):
+        text = f"The vacuum is not used to measure the noise: {why}. The noise is that of the fits' residuals."
+        remedy = "Convert frames from which no background was subtracted, or give another --vacuum-box."
+        yield Finding("vacuum", "The vacuum does not tell the noise", text, remedy, serious="cut off" in why)
     missing, ids = run.columns["incomplete"].to_numpy(), run.columns["column_id"].to_numpy()
     some = missing > 0
     if some.any():

@@ -317,7 +317,7 @@ def _left_out(run: Survey) -> str:
         return "not looked for (find_defects is off)"
     found = in_words(run.left_out)
     if run.frames.sizes["frame"] < FEWEST_FRAMES:
-        found.append(f"hot pixels and spikes are not looked for in fewer than {FEWEST_FRAMES} frames")
+        found.append(f"dead pixels and lines are not looked for in fewer than {FEWEST_FRAMES} frames")
     return ", ".join(found) or "none found"
 
 

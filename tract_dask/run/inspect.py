@@ -108,11 +108,13 @@ def _references(path: Path) -> dict[str, str]:
     return {name.replace("_", " "): place for name, place in named.items()}
 
 
-def _left_out(movie: Movie) -> dict[str, int]:
-    """Return how many pixels carry no data: of the mask, and by why they are in it; spikes; frames with a border."""
+def _left_out(movie: Movie) -> dict[str, float]:
+    """Return how many pixels carry no data: of the mask, and by why they are in it; spikes; borders; saturated ones."""
     counts = movie.pixels.counts(movie.shape[1:])
-    kinds = {f"of them {name}": counts[name] for name in KINDS.values() if name in counts}
-    rest = {name: counts.get(name, 0) for name in ("spikes", "frames with a border")}
+    kinds: dict[str, float] = {f"of them {name}": counts[name] for name in KINDS.values() if name in counts}
+    rest: dict[str, float] = {name: counts.get(name, 0) for name in ("spikes", "frames with a border")}
+    if movie.pixels.full_scale is not None:
+        rest |= {"full scale, detector units": float(movie.pixels.full_scale[0]), "saturated": counts["saturated"]}
     return {"masked pixels": sum(kinds.values())} | kinds | rest
 
 

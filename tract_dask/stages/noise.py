@@ -50,9 +50,9 @@ def measure_camera(movie: Movie, mean: Floats, covered: Bools, drift: Floats, us
     Parameters
     ----------
     mean
-        (y, x) drift-corrected mean of the frames in detector units.
+        (y, x) drift-corrected mean of the frames in detector units; NaN where no frame shows anything.
     covered
-        (y, x) where it is one.
+        (y, x) which pixels count.
     drift
         (frames, 2) in px; frames are moved by its whole part, and what is left is taken off by the mean's slope.
     used
@@ -65,7 +65,7 @@ def measure_camera(movie: Movie, mean: Floats, covered: Bools, drift: Floats, us
 def _measured(movie: Movie, mean: Floats, covered: Bools, drift: Floats, used: Bools) -> Camera:
     if used.sum() < FEWEST_FRAMES or min(mean.shape) < _SMALLEST_PX:
         return Camera(reason=f"it takes {FEWEST_FRAMES} frames of {_SMALLEST_PX} px to compare pixels")
-    level = blur(np.where(covered, mean, mean[covered].mean() if covered.any() else 0.0), _SMOOTH_PX)
+    level = blur(np.where(np.isfinite(mean), mean, mean[covered].mean() if covered.any() else 0.0), _SMOOTH_PX)
     slopes = [np.asarray(slope, np.float32) for slope in np.gradient(level)]
     cells: list[Cells] = []
     fields: list[_Field] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from ..cluster.stage_run import StageRun
 from ..errors import InputError
 from ..kernels.filling import fill_near
-from ..kernels.sums import add_frames, coverage
+from ..kernels.sums import Whole, add_frames, coverage
 from ..progress import Sink, silent
 from ..settings.declare import Settings
 from ..store import metadata, schema
@@ -36,6 +37,8 @@ SUM_PARTS = 16
 
 _SHARED = 1.5
 """Sum of the noise's autocorrelation from which read noise, which pixels do not share, matters for the gain."""
+_SATURATED = 0.03
+"""Where a larger share of a pixel's values is cut off, its mean is not known; up to here it lacks 1 % of the noise."""
 _SURE = 4.0
 """Standard errors by which the level without noise must be above the offset."""
 
@@ -55,7 +58,8 @@ def sum_image(
     feature at p in the summed image lies at p - rounding_px + drift in a frame. It is within 0.29 / sqrt(frames).
 
     Pixels without data, bad frames and frames whose drift has quality 0 are left out. A pixel that no frame covers has
-    exposure 0, and image 0; where it is one that carries no data, the mean of what is near. What some of the frames
+    exposure 0, and image 0; where it is one that carries no data, the mean of what is near. Pixels that are saturated
+    in more than 3 % of the frames have exposure 0, too, and the mean of what was recorded. What some of the frames
     tell of gain, offset and noise is the attribute ``camera``, which :meth:`tract_dask.store.camera.Camera.of` reads.
 
     Parameters
@@ -80,23 +84,32 @@ def sum_image(
     per_part = -(-len(movie.shards) // SUM_PARTS)
     parts = split(movie.n_frames, max(1, movie.shards[0].frames) * per_part)
     with StageRun("sum", movie, on_event, journal, client, runs=1) as stage:
-        done = stage.journal("parts", stage_key("sum", movie.key, shift, used), {"missing": ()})
+        done = stage.journal("parts", stage_key("sum", movie.key, shift, used), {"missing": (), "saturated": ()})
         stage.begin([(done, parts)])
         payloads = stage.run(partial(_sum_part, movie, shift, used, done.path), parts, done)
         exposure = coverage(movie.shape[1:], shift[used])
-        total, missing = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max)), False
+        total = np.zeros(movie.shape[1:], _accumulator(movie, np.iinfo(np.int64).max))
         for part in parts:
             add_frames(total, load_saved(done.path / f"{part.index}.npy")[None], np.zeros((1, 2), np.int64))
-            missing |= bool(payloads[part.index]["missing"])
-            if payloads[part.index]["missing"]:
-                exposure -= load_saved(done.path / f"{part.index}-missing.npy")
+        missing, saturated = (_count(name, done.path, parts, payloads) for name in ("missing", "saturated"))
+        if missing is not None:
+            exposure -= missing
         image = np.divide(total * movie.gain, exposure, out=np.zeros(total.shape), where=exposure > 0)
         image -= movie.gain * movie.offset * (exposure > 0)
-        if missing and not exposure.all() and exposure.any():
+        if missing is not None and not exposure.all() and exposure.any():
             image = fill_near(np.where(exposure > 0, image, np.nan)).astype(np.float64)
+        known = (exposure > 0) | (image != 0)
+        if saturated is not None:
+            exposure[saturated > _SATURATED * exposure] = 0
         rounding = np.zeros(2) if drift is None else (drift["drift"].to_numpy() - shift)[used].mean(axis=0)
-        mean, shifts = image / movie.gain + movie.offset, schema.drift_of(drift, movie.n_frames)
-        camera = measure_camera(movie, mean, exposure > used.sum() / 2, shifts, used)
+        mean, shifts = (
+            np.where(known, image / movie.gain + movie.offset, np.nan),
+            schema.drift_of(drift, movie.n_frames),
+        )
+        covered = exposure > used.sum() / 2
+        if saturated is not None:  # their noise is cut off, too: up to this level that of hardly any pixel is
+            covered &= image < np.quantile(image[saturated > 0], _SATURATED)
+        camera = measure_camera(movie, mean, covered, shifts, used)
         stage.end(f"mean of {int(used.sum())} frames")
     variables = {"image": image, "exposure": exposure.astype(np.uint32)}
     return xr.Dataset(
@@ -106,8 +119,15 @@ def sum_image(
             "pixel_size_pm": movie.pixel_size_pm,
             "rounding_px": [float(value) for value in rounding],
             **camera.to_attribute(),
+            **({"saturated": True} if saturated is not None else {}),
         },
     )
+
+
+def _count(what: str, folder: Path, parts: Sequence[Shard], payloads: dict[int, Payload]) -> Whole | None:
+    """Return how often each pixel (y, x) of the sum was missing, or saturated; None where none was."""
+    found = [load_saved(folder / f"{part.index}-{what}.npy") for part in parts if payloads[part.index][what]]
+    return np.sum(found, axis=0, dtype=np.int64) if found else None
 
 
 def _whole_pixels(movie: Movie, drift: xr.Dataset | None) -> tuple[NDArray[np.int64], Bools]:
@@ -130,15 +150,20 @@ def _accumulator(movie: Movie, n_frames: int) -> np.dtype[Any]:
 
 
 def _sum_part(movie: Movie, shift: NDArray[np.int64], used: Bools, folder: Path, part: Shard) -> Payload:
-    """Add up some frames at their places; leave the sum, and a count of pixels that hold no number, in ``folder``."""
+    """Add up some frames at their places; leave the sum, and counts of missing and saturated pixels, in ``folder``."""
     total = np.zeros(movie.shape[1:], _accumulator(movie, part.frames))
     missing = np.zeros(movie.shape[1:] if movie.dtype.kind == "f" else (0, 0), np.int64)
+    full = movie.full_scale
+    saturated = np.zeros(movie.shape[1:] if full is not None else (0, 0), np.int64)
     first, last = part.start // movie.frames_per_shard, -(-part.stop // movie.frames_per_shard)
     for start, top, left, tile in chain.from_iterable(map(movie.tiles, movie.shards[first:last])):
         here = slice(start, start + len(tile))
         frames, places = tile, shift[here] - [top, left]
         if not used[here].all():
             frames, places = frames[used[here]], places[used[here]]
+        if full is not None and (reached := np.isposinf(frames)).any():
+            add_frames(saturated, reached, places)
+            frames = np.where(reached, frames.dtype.type(full), frames)
         if missing.size and not (finite := np.isfinite(frames)).all():
             add_frames(missing, ~finite, places)
             frames = np.where(finite, frames, 0.0)
@@ -146,7 +171,9 @@ def _sum_part(movie: Movie, shift: NDArray[np.int64], used: Bools, folder: Path,
     save_array(folder / f"{part.index}.npy", total)
     if missing.any():
         save_array(folder / f"{part.index}-missing.npy", missing)
-    return {"missing": bool(missing.any())}
+    if saturated.any():
+        save_array(folder / f"{part.index}-saturated.npy", saturated)
+    return {"missing": bool(missing.any()), "saturated": bool(saturated.any())}
 
 
 def sum_stage(

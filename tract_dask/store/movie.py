@@ -109,7 +109,8 @@ class Movie:
     shape
         Frames, rows and columns.
     dtype
-        Pixel type of what is read: that of the file, or real numbers where pixels carry no data, which are NaN.
+        Pixel type of what is read: that of the file, or real numbers where pixels carry no data, which are NaN, or are
+        saturated, and infinite.
     key
         Key of what it was made from.
     frames_per_shard
@@ -178,8 +179,16 @@ class Movie:
 
     @property
     def pixels(self) -> Pixels:
-        """Which pixels carry no data: they are read as NaN."""
+        """Which pixels carry no data: they are read as NaN, or as infinity where they are saturated."""
         return pixels_of(self.path, self.key)
+
+    @property
+    def full_scale(self) -> float | None:
+        """Detector units at which pixels are cut off; None where they are not, or it is not known.
+
+        With references it is that of the median pixel, corrected.
+        """
+        return self.pixels.level_cut_off
 
     def read_tiles(self, start: int, stop: int, boxes: NDArray[np.int64]) -> Tiles:
         """Return the tiles of frames ``start`` to ``stop`` (not included) that boxes touch, as they are decoded.

@@ -3,14 +3,15 @@
 Array ``0`` holds the frames as they were recorded. In the group ``pixels`` lie ``mask`` (y, x), why a pixel is left out
 of every frame; ``spikes`` (n, 3), frame, row and column of pixels that are left out of one frame; ``borders``
 (frames, 4), first and last row and column (not included) of what a frame shows; ``dark`` and ``gain`` (y, x), what is
-subtracted from a pixel, and what it is multiplied by then. Only what there is is stored. A movie is read corrected,
-with NaN at the pixels that carry no data.
+subtracted from a pixel, and what it is multiplied by then; ``full_scale`` (1,), the recorded value at which pixels are
+cut off, and ``saturated`` (frames,), how many are. Only what there is is stored. A movie is read corrected, with NaN at
+the pixels that carry no data, and infinity where they are saturated: what they hold is a lower bound.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ _DIMENSIONS = {
     "borders": ("t", "edge"),
     "dark": ("y", "x"),
     "gain": ("y", "x"),
+    "full_scale": ("level",),
+    "saturated": ("t",),
 }
 
 
@@ -52,6 +55,10 @@ class Pixels:
         (y, x) float32, what is subtracted from every frame, in detector units.
     gain
         (y, x) float32, what frames are multiplied by then.
+    full_scale
+        (1,) value at which pixels are cut off, detector units.
+    saturated
+        (frames,) how many pixels of a frame have it, beside those that are left out already.
     """
 
     mask: NDArray[np.uint8] | None = None
@@ -59,6 +66,8 @@ class Pixels:
     borders: NDArray[np.int32] | None = None
     dark: NDArray[np.float32] | None = None
     gain: NDArray[np.float32] | None = None
+    full_scale: NDArray[np.float64] | None = None
+    saturated: NDArray[np.uint32] | None = None
 
     def __bool__(self) -> bool:
         return any(getattr(self, field.name) is not None for field in fields(self))
@@ -73,10 +82,13 @@ class Pixels:
             found["spikes"] = len(self.spikes)
         if self.borders is not None:
             found["frames with a border"] = int((self.borders != [0, shape[0], 0, shape[1]]).any(axis=1).sum())
+        if self.saturated is not None:
+            found["saturated"] = int(self.saturated.sum(dtype=np.int64))
+            found["frames with saturated pixels"] = int(np.count_nonzero(self.saturated))
         return found
 
     def applied(self, block: NDArray[Any], first: int, top: int = 0, left: int = 0) -> NDArray[Any]:
-        """Return frames (frames, y, x), corrected, as real numbers, NaN where a pixel carries no data.
+        """Return frames (frames, y, x), corrected, as real numbers: NaN without data, infinite where saturated.
 
         Parameters
         ----------
@@ -91,6 +103,8 @@ class Pixels:
                 part = reference[rows, columns]
                 inside = shown[:, : part.shape[0], : part.shape[1]]
                 correct(inside, part, out=inside)
+        if self.full_scale is not None:
+            shown[block >= block.dtype.type(self.full_scale[0])] = np.inf
         if self.mask is not None and (masked := self.mask[rows, columns] > 0).any():
             shown[:, : masked.shape[0], : masked.shape[1]][:, masked] = np.nan
         if self.spikes is not None:
@@ -103,6 +117,14 @@ class Pixels:
                 y0, y1, x0, x1 = (max(0, edge) for edge in (y0 - top, y1 - top, x0 - left, x1 - left))
                 frame[:y0], frame[y1:], frame[:, :x0], frame[:, x1:] = np.nan, np.nan, np.nan, np.nan
         return shown
+
+    @cached_property
+    def level_cut_off(self) -> float | None:
+        """Value at which pixels are cut off, corrected as the median pixel is; None where they are not."""
+        if self.full_scale is None:
+            return None
+        dark, gain = (1.0 * np.median(one) if one is not None else None for one in (self.dark, self.gain))
+        return float((self.full_scale[0] - (dark or 0.0)) * (1.0 if gain is None else gain))
 
     def write(self, store: Path, shape: tuple[int, ...]) -> dict[str, Any]:
         """Write what there is into the ``store`` of a movie of frames (y, x); return what its attributes say of it."""
@@ -123,7 +145,8 @@ class Pixels:
                 zarr_format=3,
             )
             datasets.overwrite_array(store / GROUP / name, values)
-        return {"arrays": names} | self.counts(shape) if names else {}
+        full = {} if self.full_scale is None else {"full scale": float(self.full_scale[0])}
+        return {"arrays": names} | self.counts(shape) | full if names else {}
 
 
 NO_PIXELS = Pixels()
@@ -144,7 +167,14 @@ def in_words(counts: dict[str, int]) -> list[str]:
     >>> in_words({"hot": 3, "lines": 512, "spikes": 1, "frames with a border": 20})
     ['3 hot pixels, 512 pixels in lines and 1 spike left out', '20 frames with a border']
     """
-    forms = {"hot": "hot pixel", "dead": "dead pixel", "lines": "pixel", "given": "given pixel", "spikes": "spike"}
+    forms = {
+        "hot": "hot pixel",
+        "dead": "dead pixel",
+        "lines": "pixel",
+        "given": "given pixel",
+        "spikes": "spike",
+        "saturated": "saturated pixel",
+    }
     found = [
         f"{counts[name]} {form}{'s' if counts[name] != 1 else ''}{' in lines' if name == 'lines' else ''}"
         for name, form in forms.items()

@@ -20,6 +20,7 @@ from ...settings.run import ColumnSettings
 from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv
 from ...store.schema import Status
+from ..filled import fill_holes
 from .contrast import SIGNS, chosen, support
 from .detect import METHODS, make_detector
 from .lattice import (
@@ -47,18 +48,22 @@ _SHAPE_FACTOR = 1.5
 _SHAPE_MARGIN = 1.1
 """With sigmas within this factor of the median."""
 _FEWEST_FOR_SHAPE = 5
+_TOP = 0.95
+"""What frames do not show, and is at least this share of the brightest that they do, is saturated."""
 
 
 @dataclass(frozen=True)
 class _Scene:
     """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``.
 
-    A pixel is a number of ``unit`` counts. ``lattices`` are those that were looked for, by the spacing that was given.
+    A pixel is a number of ``unit`` counts; ``known`` tells those that some frame shows, where ``valid`` has small holes
+    and saturated tops filled. ``lattices`` are those that were looked for, by the spacing that was given.
     """
 
     counts: NDArray[np.float64]
     image: NDArray[np.float64]
     valid: NDArray[np.bool_]
+    known: NDArray[np.bool_]
     sign: int
     noise: float
     blur_sigma_px: float
@@ -231,14 +236,16 @@ def _scene(summed: xr.Dataset, blur_sigma_px: float) -> _Scene:
         raise InputError(
             "the summed image is empty", "columns", "exposed pixels", "none", "Check the drift: it may leave no overlap"
         )
+    known = valid
     if not valid.all():
-        whole = without_holes(valid)
-        near = fill_near(np.where(valid, counts, np.nan)) if (whole & ~valid).any() else counts
-        counts = np.where(valid, counts, np.where(whole, near, np.median(sample(counts[valid]))))
-        valid = whole
+        top = _TOP * float(counts[valid].max()) if summed.attrs.get("saturated") else np.inf
+        shown = np.isfinite(counts) & (valid | (counts >= top))
+        valid = without_holes(shown)
+        near = fill_near(np.where(shown, counts, np.nan)) if (valid & ~shown).any() else counts
+        counts = np.where(shown, counts, np.where(valid, near, np.median(sample(counts[known]))))
     unit = unit_of(counts)
     counts = counts if unit == 1 else counts / unit
-    return _Scene(counts, counts, valid, SIGNS["bright"], pixel_noise(counts, valid), blur_sigma_px, unit)
+    return _Scene(counts, counts, valid, known, SIGNS["bright"], pixel_noise(counts, valid), blur_sigma_px, unit)
 
 
 def _refined(raised: Relief, places: Places, search: float, centroid: float) -> Places:
@@ -361,6 +368,10 @@ def _fit(
     windows = cut_windows(scene.counts[None], y[None], x[None], window_px, scene.blur_sigma_px)[0]
     start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
     options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200, "radius_px": window_px / 2}
+    filling = windows, np.where(scene.known, scene.counts, np.nan), corner[inside], scene.blur_sigma_px
+    moving = fill_holes(
+        *filling, lambda some, n: fit_gaussians(some, start[n], lower[n], upper[n], **options).estimates
+    )
     fits = fit_gaussians(windows, start, lower, upper, **options)
     odd = _odd_shapes(fits, kind[inside], start, lower, upper)
     if odd.any():
@@ -368,10 +379,10 @@ def _fit(
         for name in ("estimates", "status", "r_squared"):
             getattr(fits, name)[odd] = getattr(again, name)
     fit[inside], explained[inside] = fits.estimates, fits.r_squared
-    fit[inside, X] += x
-    fit[inside, Y] += y
+    fit[inside, X : Y + 1] += corner[inside]
     weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.noise * damping(scene.blur_sigma_px))
-    flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: ~fits.converged, Status.AT_BOUND: fits.at_bound}
+    restless = ~fits.converged | np.isin(np.arange(len(weak)), moving)
+    flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: restless, Status.AT_BOUND: fits.at_bound}
     for flag, found in flags.items():
         status[inside] |= np.where(found, flag, Status.OK).astype(np.uint8)
     return fit, status, explained

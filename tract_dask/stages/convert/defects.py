@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.borders import shown_part
-from ...kernels.defects import History, Moments, Noise, find_spikes, look_back
+from ...kernels.defects import History, Moments, Noise, find_spikes, look_at_few, look_back
+from ...kernels.saturation import full_scale
 from ...readers.source import FrameSource
 from ...settings.run import ConvertSettings
 from ...store.arrays import DamagedArrayError, load_saved, save_array
@@ -20,7 +21,7 @@ from .references import read_references
 
 _SAMPLE_FRAMES = 32
 FEWEST_FRAMES = 6
-"""With fewer a hot pixel cannot be told from a spike."""
+"""With fewer only pixels that are higher than their neighbours are found."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,17 @@ class Finder:
             return either[0] if either else None
         return np.where(named > 0, named, found)
 
+    def saturated(self, frame: NDArray[Any], shown: NDArray[Any]) -> tuple[int, int]:
+        """Return how many pixels of a frame (y, x) are at full scale, and how many are higher.
+
+        Those that carry no data do not count: ``shown`` is the frame with NaN there.
+        """
+        full = self.history.full_scale if self.history else None
+        if full is None or not (reached := frame >= frame.dtype.type(full)).any():
+            return 0, 0
+        reached &= np.isfinite(shown)
+        return int(np.count_nonzero(reached)), int(np.count_nonzero(frame[reached] > full))
+
 
 def _border(frame: NDArray[Any]) -> NDArray[np.int32] | None:
     shown = shown_part(frame)
@@ -86,7 +98,7 @@ def finder_for(source: FrameSource, folder: Path, settings: ConvertSettings) -> 
         save_array(folder / "mask.npy", history.mask if history else np.zeros(shape, np.uint8))
         save_array(folder / "usual.npy", history.usual if history else np.zeros(shape, np.float32))
         save_array(folder / "searches.npy", np.array(settings.find_defects))
-        save_array(folder / "noise.npy", np.array(history.noise if history else (0.0, 0.0)))
+        _save_limits(folder / "limits.npy", history)
 
 
 @lru_cache(maxsize=2)
@@ -96,30 +108,44 @@ def found_in(folder: Path) -> Finder:
 
 
 def _load(folder: Path) -> Finder:
-    mask, usual, noise, searches = (
-        load_saved(folder / f"{name}.npy") for name in ("mask", "usual", "noise", "searches")
+    mask, usual, limits, searches = (
+        load_saved(folder / f"{name}.npy") for name in ("mask", "usual", "limits", "searches")
     )
     named, dark, gain = (
         values if values.size else None for values in (load_saved(folder / f"{name}.npy") for name in _REFERENCES)
     )
-    history = History(mask, usual, Noise(*map(float, noise))) if mask.size else None
+    even, slope, full, relief = map(float, limits)
+    noise = Noise(even, slope)
+    history = History(mask, usual, noise, None if np.isnan(full) else full, relief) if mask.size else None
     return Finder(history, Pixels(mask=named, dark=dark, gain=gain), bool(searches))
+
+
+def _save_limits(path: Path, history: History | None) -> None:
+    full = history.full_scale if history else None
+    limits = (*history.noise, np.nan if full is None else full, history.relief) if history else (0.0,) * 4
+    save_array(path, np.array(limits))
 
 
 def _history(source: FrameSource, finder: Finder) -> History | None:
     """Return what pairs of frames, spread over the movie and corrected, tell of its pixels."""
     n_frames = source.shape[0]
     if n_frames < FEWEST_FRAMES:
-        return None
+        return look_at_few([finder.corrected(source.read(number, number + 1)[0]) for number in range(n_frames)])
     moments, pairs = Moments(source.shape[1:]), _SAMPLE_FRAMES // 2
     whole = n_frames <= _SAMPLE_FRAMES
     starts = range(n_frames) if whole else [k * (n_frames - 2) // (pairs - 1) for k in range(pairs)]
+    highest, high = np.full((2, *(source.shape[1:] if finder.references else (0, 0))), -np.inf, np.float32)
     for number, start in enumerate(starts):
         frames = source.read(start, start + (1 if whole else 2))
         for k, frame in enumerate(frames):
             moments.add(finder.corrected(frame), follows=k > 0 or (whole and number > 0))
+            if finder.references:
+                high, highest = np.maximum(high, np.minimum(highest, frame)), np.maximum(highest, frame)
     with np.errstate(invalid="ignore", over="ignore"):  # pixels that hold no number
-        return look_back(moments)
+        history = look_back(moments)
+    if history and finder.references:  # recorded values are cut off, and not corrected ones
+        return history._replace(full_scale=full_scale(high.astype(np.float32), frame, history.mask == 0))
+    return history
 
 
 def in_payload(found: dict[int, Pixels]) -> dict[str, Any]:
@@ -131,6 +157,10 @@ def in_payload(found: dict[int, Pixels]) -> dict[str, Any]:
     return ({"spikes": spikes} if spikes else {}) | ({"borders": borders} if borders else {})
 
 
+_HIGHER = 0.1
+"""Where a larger share of these pixels is higher than what was taken for full scale, it is not."""
+
+
 class Gathered:
     """What the tasks of a conversion have found."""
 
@@ -138,19 +168,26 @@ class Gathered:
         self._whole, self._n_frames = np.array([0, shape[0], 0, shape[1]], np.int32), n_frames
         self._spikes: list[list[int]] = []
         self._borders: dict[str, list[int]] = {}
+        self._saturated, self._higher = np.zeros(n_frames, np.uint32), 0
 
     def add(self, payload: dict[str, Any]) -> None:
         """Add what a task left."""
         self._spikes += payload.get("spikes", [])
         self._borders |= payload.get("borders", {})
+        for number, (reached, higher) in payload.get("saturated", {}).items():
+            self._saturated[int(number)] = reached
+            self._higher += higher
 
     def pixels(self, finder: Path | None) -> Pixels:
         """Return what is left out of the movie, with the mask that is in the finder's folder."""
         known = found_in(finder) if finder else Finder(None)
         spikes = np.array(sorted(self._spikes), np.int32) if self._spikes else None
         every = replace(known.references, mask=known.mask, spikes=spikes)
-        if not self._borders:
+        if self._borders:
+            borders = np.tile(self._whole, (self._n_frames, 1))
+            borders[[int(number) for number in self._borders]] = list(self._borders.values())
+            every = replace(every, borders=borders)
+        full = known.history.full_scale if known.history else None
+        if full is None or not self._saturated.any() or self._higher > _HIGHER * self._saturated.sum():
             return every
-        borders = np.tile(self._whole, (self._n_frames, 1))
-        borders[[int(number) for number in self._borders]] = list(self._borders.values())
-        return replace(every, borders=borders)
+        return replace(every, full_scale=np.array([full]), saturated=self._saturated)

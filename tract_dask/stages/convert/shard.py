@@ -66,8 +66,8 @@ def convert_shard(job: Job, shard: Shard) -> Payload:
     """Read the frames of a shard, measure and bin them, write them; return their statistics.
 
     Pixels are written as they were recorded; statistics and binned means are of corrected ones, and leave out those
-    without data. Beside the statistics are the spikes of frames, ``spikes`` (n, 3) frame, y, x, and their ``borders``,
-    by frame.
+    without data. Beside the statistics are the spikes of frames, ``spikes`` (n, 3) frame, y, x, and, by frame, their
+    ``borders`` and how many pixels are ``saturated``, and higher.
     """
     source = _opened(job.source, job.source_settings, job.permit, job.stamps.digest)
     check = partial(check_files, job, source, shard)
@@ -85,19 +85,22 @@ def convert_shard(job: Job, shard: Shard) -> Payload:
     finder = found_in(job.finder) if job.finder else None
     statistics: dict[str, list[float]] = {name: [] for name in schema.STATISTICS}
     left_out: dict[int, Pixels] = {}
+    saturated: dict[str, tuple[int, int]] = {}
     with files.disk_errors(job.path), ExitStack() as stack:
         writers = [stack.enter_context(_writer(job, factor, shard.index)) for factor in (1, *job.layout.bins)]
         for number, frame in enumerate(_read_ahead(source, shard, job.layout.chunk[0]), shard.start):
             shown = finder.corrected(frame) if finder else frame
             if finder and (odd := finder.look(frame, shown)):
                 shown, left_out[number] = odd.applied(shown[None], 0)[0], odd
+            if finder and any(reached := finder.saturated(frame, shown)):
+                saturated[str(number)] = reached
             *measures, levels = meters[shown.dtype].measure(shown)
             for writer, pixels in zip(writers, (frame, *levels), strict=True):
                 writer.add(pixels)
             for values, measure in zip(statistics.values(), measures, strict=True):
                 values.append(measure)
         check()  # before the shards take their places
-    return statistics | in_payload(left_out)
+    return statistics | in_payload(left_out) | ({"saturated": saturated} if saturated else {})
 
 
 class _Meters(dict[np.dtype[Any], FrameMeter]):

@@ -260,6 +260,8 @@ def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
     for start in range(shard.start, shard.stop, step):
         stop = min(start + step, shard.stop)
         block = movie.read(start, stop) if stored == 1 else movie.read_binned(stored, start, stop)
+        if stored == 1 and movie.full_scale is not None:
+            block[np.isposinf(block)] = movie.full_scale
         for raw in block[:, :ny, :nx]:  # without bins that hang over the edge
             odd = raw.dtype.kind == "f" and not np.isfinite(raw).all()
             image, shows_anything = clean_image(fill_near(raw) if odd else raw)

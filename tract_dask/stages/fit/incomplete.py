@@ -1,8 +1,7 @@
-"""Windows that miss pixels, fitted to those that are there.
+"""Windows that miss pixels, fitted to those that are there (:mod:`tract_dask.stages.filled`).
 
-A window without data at some pixels is filled there by its own fit, fitted again, and so on until the place rests:
-expectation and maximisation, whose end is the fit to the pixels that are there. Filled pixels bring no information, so
-the errors are those of the filled window times what is lost with the pixels (:func:`.missing.widening`).
+Filled pixels bring no information, so the errors are those of the filled window times what is lost with the pixels
+(:func:`.missing.widening`).
 """
 
 from __future__ import annotations
@@ -12,22 +11,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.filling import fill_near
 from ...kernels.gaussian.missing import widening
-from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, X, Y
-from ...kernels.windows import Tiles, cut_windows, gaussian_kernel
+from ...kernels.windows import Tiles, gaussian_kernel
 from ...settings.run import FitSettings
+from ..filled import fill_windows
 from .frame_fits import FrameFits
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LARGEST_GROWTH = 3.0
 """A window is fitted while the error of its column's place grows by no more than this."""
-
-_RESTS_PX = 2e-3
-_MOST_ROUNDS = 40
 
 
 def cut_raw(
@@ -53,15 +47,19 @@ def fit_incomplete(
     raw: NDArray[np.float32],
     settings: FitSettings,
     fit: Callable[[NDArray[np.float32], NDArray[np.int64]], FrameFits],
+    full_scale: float | None = None,
 ) -> tuple[FrameFits, Bools, Bools]:
     """Fit windows to the pixels that are there.
 
     Parameters
     ----------
     raw
-        (n, side, side) pixels before the blur, with the margin that the blur reaches; NaN or infinite where missing.
+        (n, side, side) pixels before the blur, with the margin that the blur reaches; NaN where missing, infinite where
+        saturated.
     fit
         Fits blurred windows (m, h, w), which are those of these numbers (m,).
+    full_scale
+        What saturated pixels reach; None: they are as missing ones.
 
     Returns
     -------
@@ -71,23 +69,16 @@ def fit_incomplete(
     """
     margin = gaussian_kernel(settings.window_blur_px).size // 2
     size = raw.shape[-1] - 2 * margin
-    there = np.isfinite(raw)
-    inner = there[:, margin : margin + size, margin : margin + size]
-    away = np.hypot(*np.indices(raw.shape[1:]) - raw.shape[1] // 2)
-    own = ~there & (away <= size / 2 + margin)
-    filled = np.stack([fill_near(image) for image in raw])
-    moving = np.arange(len(raw))
-    estimates = np.array(fit(_blurred(filled, margin, size, settings), moving).estimates)
-    for _ in range(_MOST_ROUNDS):
-        model = _unblurred(estimates[moving], settings, margin, raw.shape[-1])
-        filled[moving] = np.where(own[moving], model, filled[moving])
-        now = fit(_blurred(filled[moving], margin, size, settings), moving).estimates
-        step = np.abs(now - estimates[moving])[:, [X, Y]].max(axis=1)
-        estimates[moving] = now
-        moving = moving[step > _RESTS_PX]
-        if not moving.size:
-            break
-    fits = fit(_blurred(filled, margin, size, settings), np.arange(len(raw)))
+    inner = np.isfinite(raw[:, margin : margin + size, margin : margin + size])
+    windows, moving = fill_windows(
+        raw,
+        settings.window_blur_px,
+        lambda windows, numbers: fit(windows, numbers).estimates,
+        full_scale=full_scale,
+        counting=settings.counting,
+        free=settings.shape == "free",
+    )
+    fits = fit(windows, np.arange(len(raw)))
     disc = np.hypot(*np.indices((size, size)) - size // 2) <= size / 2
     missing = np.invert(inner[:, disc].all(axis=1))
     factors, volume = widening(
@@ -106,15 +97,3 @@ def fit_incomplete(
     fits.residual[:] *= np.sqrt(share)
     fits.ratio[:] *= share
     return fits, missing, lost
-
-
-def _blurred(filled: NDArray[np.float32], margin: int, size: int, settings: FitSettings) -> NDArray[np.float32]:
-    corner = np.full((len(filled), 1), margin)
-    return cut_windows(filled, corner, corner, size, settings.window_blur_px)[:, 0]
-
-
-def _unblurred(estimates: Floats, settings: FitSettings, margin: int, side: int) -> NDArray[np.float32]:
-    """Return what fits expect before the blur, (n, side, side)."""
-    raw = blurred(estimates, -(settings.window_blur_px**2))
-    raw[:, [X, Y]] += margin
-    return evaluate(raw, np.arange(side), np.arange(side)[:, None]).astype(np.float32)

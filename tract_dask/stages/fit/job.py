@@ -29,7 +29,7 @@ from ...store.strangers import MOVIE_KEY
 from ..columns.window_size import neighbour_distance, resolve_window
 from ..pixel_range import check_pixels
 from .noise_size import WindowNoise, window_noise
-from .vacuum import check_box, find_vacuum
+from .vacuum import check_box, find_vacuum, why_unusable
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,10 @@ class Job:
     """Share of the noise that the residuals of a fit show."""
     lost: tuple[int, ...] = ()
     """Frames that could not be registered."""
+    unusable: str | None = None
+    """Why the noise of the vacuum is not taken, in words."""
+    full_scale: float | None = None
+    """Counts at which pixels are cut off; None where they are not."""
 
     def save(self, path: Path, movie: Movie, key: str) -> None:
         """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
@@ -82,6 +86,7 @@ class Job:
             part=movie.part,
             window=self.window_px,
             vacuum=self.vacuum,
+            vacuum_unusable=self.unusable,
             reference_blur_px=self.reference_blur_px,
             refine_columns=self.refined_by,
             offset=self.offset,
@@ -115,6 +120,8 @@ class Job:
             scale=about["threshold_scale"],
             left_over=about["residual_share"],
             lost=tuple(about["lost"]),
+            unusable=about["vacuum_unusable"],
+            full_scale=_full_scale(movie),
         )
 
     @cached_property
@@ -160,6 +167,11 @@ class Job:
         """What is subtracted from windows, in :attr:`unit`: what is left is as large as its variance."""
         return np.float32(0 if self.settings.filters_frames else (self.offset - self.dark_variance) / self.unit)
 
+    @property
+    def full_scale_in_unit(self) -> float | None:
+        """What saturated pixels of windows reach, in :attr:`unit`."""
+        return None if self.full_scale is None else self.full_scale / self.unit - float(self.floor)
+
     @cached_property
     def filters(self) -> Filters:
         """The matched filter of each column, by which it is told whether it is there."""
@@ -196,6 +208,8 @@ def prepare(
     if box is None and summed is not None:
         box = find_vacuum(summed, columns, settings.blur_sigma_px)
     statistics = movie.statistics()
+    bad = schema.bad_frames(statistics, math.prod(movie.shape[1:]))
+    unusable = why_unusable(movie, box, shift, ~bad) if box else None
     check_pixels(statistics, str(movie.path))
     camera = camera_of(movie, summed)
     if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0 and movie.pixels.dark is None:
@@ -204,9 +218,10 @@ def prepare(
     return Job(
         columns,
         shift,
-        schema.bad_frames(statistics, math.prod(movie.shape[1:])),
+        bad,
         window_px=window_px,
-        vacuum=box,
+        vacuum=None if unusable else box,
+        unusable=unusable,
         reference_blur_px=columns.attrs.get("blur_sigma_px", settings.blur_sigma_px),
         refined_by=settings.refine_columns if settings.refine_drift and measured else None,
         settings=settings,
@@ -214,7 +229,12 @@ def prepare(
         offset=movie.gain * movie.offset,
         dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
         correlation=camera.correlation if camera.shared.size > 1 else None,
+        full_scale=_full_scale(movie),
     )
+
+
+def _full_scale(movie: Movie) -> float | None:
+    return None if movie.full_scale is None else movie.gain * movie.full_scale
 
 
 def _lost(drift: xr.Dataset | None) -> tuple[int, ...]:

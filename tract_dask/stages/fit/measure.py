@@ -239,7 +239,7 @@ def _fit_again(
     def fit(windows: NDArray[np.float32], numbers: NDArray[np.int64]) -> FrameFits:
         return _fit_windows(windows, [values[which[numbers]] for values in bounds], column[numbers], job)
 
-    found, missing, lost = fit_incomplete(raw, job.settings, fit)
+    found, missing, lost = fit_incomplete(raw, job.settings, fit, job.full_scale_in_unit)
     lost |= missing & ~job.known[column]  # neither the place nor the shape of such a column was ever seen whole
     for name, values in vars(found).items():
         vars(fits)[name][which] = values

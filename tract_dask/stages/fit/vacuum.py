@@ -13,6 +13,7 @@ from ...errors import SettingsError
 from ...kernels.gaussian.parameters import AMPLITUDE
 from ...kernels.magnitude import unit_of
 from ...kernels.windows import blur
+from ...store.movie import Movie
 from ..columns.lattice import without_holes
 
 _SHARES = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8)
@@ -20,6 +21,13 @@ _FLAT = 0.1
 _MIN_SIDE_PX = 24
 _PADDING_PX, _EDGE = 17, 0.05
 """Padding is a square of this side at least, whose edge is this share of the columns' amplitude."""
+_LOOKED_AT = 4
+"""Frames in which vacuum is looked at."""
+_FEWEST_COUNTS = 20
+"""In a frame: fewer leave the noise of some frames at zero."""
+_CUT_SHARE, _CUT = 0.1, 3.0
+"""Values were cut off where more than this share has the lowest one, and so many times as many as counts would have:
+with n pixels of the lowest value and the mean m, in steps to the next value, that has m n pixels."""
 _STEPS = 16
 """Squares are looked for in steps of this share of the smallest one's side."""
 
@@ -59,6 +67,45 @@ def find_vacuum(summed: xr.Dataset, columns: xr.Dataset, sigma: float) -> tuple[
     for side, (spread, y, x) in zip(sides, flattest, strict=True):
         if spread <= _FLAT * amplitude and spread <= 2 * best:
             return y, y + side, x, x + side
+    return None
+
+
+def why_unusable(movie: Movie, box: tuple[int, ...], shift: NDArray[np.float64], used: NDArray[np.bool_]) -> str | None:
+    """Return why the noise of a box of vacuum does not tell that of the columns, in words; None where it does.
+
+    Parameters
+    ----------
+    box
+        y0, y1, x0, x1 in the summed image.
+    shift
+        (frames, 2) drift, px.
+    used
+        (frames,) frames that show something.
+    """
+    which = np.flatnonzero(used)
+    parts = []
+    for number in which[np.linspace(0, len(which) - 1, min(_LOOKED_AT, len(which))).astype(int)] if len(which) else ():
+        dy, dx = np.rint(shift[number]).astype(int)
+        rows, columns = (
+            slice(max(0, low + step), max(0, high + step))
+            for low, high, step in ((box[0], box[1], dy), (box[2], box[3], dx))
+        )
+        pixels = movie.read(int(number), int(number) + 1, rows, columns)
+        parts.append(pixels[np.isfinite(pixels)].astype(np.float64))
+    values = np.concatenate(parts) if parts else np.empty(0)
+    if not values.size:
+        return "its pixels carry no data"
+    lowest = values.min()
+    above = values[values > lowest]
+    if not above.size:
+        return f"all of its pixels have the value {lowest:g}"
+    step = above.min() - lowest
+    counts, share = (values - lowest).sum() / step, 1 - above.size / values.size
+    if counts < _FEWEST_COUNTS * len(parts):
+        return f"it has {counts / len(parts):.0f} counts a frame"
+    next_lowest = np.count_nonzero(above == lowest + step)
+    if share > _CUT_SHARE and (values.size - above.size) * counts / values.size > _CUT * next_lowest:
+        return f"{share:.0%} of its pixels have the lowest value, {lowest:g}: what was below was cut off"
     return None
 
 

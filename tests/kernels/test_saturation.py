@@ -1,0 +1,47 @@
+"""Full scale is found where pixels are cut off, and nowhere else."""
+
+import numpy as np
+import pytest
+
+from tract_dask.kernels.saturation import full_scale
+
+SHAPE = (90, 96)
+
+
+def levels(amplitude, background):
+    """Expected counts of a field of columns."""
+    y, x = (np.exp(-0.5 * ((np.arange(side) % 24 - 11.3) / 4.0) ** 2) for side in SHAPE)
+    return background + amplitude * np.outer(y, x)
+
+
+def found(frames):
+    return full_scale(np.sort(frames.astype(np.float32), axis=0)[-2], frames[0], np.ones(SHAPE, bool))
+
+
+def counts(amplitude, background, n_frames=12):
+    return np.random.default_rng(0).poisson(levels(amplitude, background), (n_frames, *SHAPE))
+
+
+@pytest.mark.parametrize(
+    ("level", "offset", "cut_off"), [((60, 20), 0, 63), ((900, 300), -40, 760), ((5e4, 1e4), 0, 40_000), ((4, 2), 0, 3)]
+)
+def test_full_scale_is_where_pixels_are_cut_off(level, offset, cut_off):
+    frames = np.minimum(counts(*level) + offset, cut_off)
+    assert found(frames) == cut_off
+    assert found(frames.astype(np.float32)) == cut_off
+
+
+@pytest.mark.parametrize("level", [(60, 20), (900, 300), (5e4, 1e4), (2, 1), (0.05, 0.01)])
+def test_counts_that_are_not_cut_off_have_none(level):
+    assert found(counts(*level)) is None
+    assert found(7.3 * counts(*level) + 100) is None
+
+
+def test_a_counting_camera_of_one_bit_at_a_low_dose_has_none():
+    assert found(np.minimum(counts(0.3, 0.1), 1)) is None
+
+
+def test_frames_without_noise_have_none():
+    still = np.repeat(np.rint(levels(200, 30))[None], 4, axis=0)
+    assert found(still) is None
+    assert found(np.full((4, *SHAPE), 5.0)) is None
