@@ -98,18 +98,12 @@ def sum_image(
         image -= movie.gain * movie.offset * (exposure > 0)
         if missing is not None and not exposure.all() and exposure.any():
             image = fill_near(np.where(exposure > 0, image, np.nan)).astype(np.float64)
-        known = (exposure > 0) | (image != 0)
+        mean = np.where((exposure > 0) | (image != 0), image / movie.gain + movie.offset, np.nan)
         if saturated is not None:
             exposure[saturated > _SATURATED * exposure] = 0
         rounding = np.zeros(2) if drift is None else (drift["drift"].to_numpy() - shift)[used].mean(axis=0)
-        mean, shifts = (
-            np.where(known, image / movie.gain + movie.offset, np.nan),
-            schema.drift_of(drift, movie.n_frames),
-        )
-        covered = exposure > used.sum() / 2
-        if saturated is not None:  # their noise is cut off, too: up to this level that of hardly any pixel is
-            covered &= image < np.quantile(image[saturated > 0], _SATURATED)
-        camera = measure_camera(movie, mean, covered, shifts, used)
+        covered = (exposure > used.sum() / 2) & _is_whole(image, saturated)
+        camera = measure_camera(movie, mean, covered, schema.drift_of(drift, movie.n_frames), used)
         stage.end(f"mean of {int(used.sum())} frames")
     variables = {"image": image, "exposure": exposure.astype(np.uint32)}
     return xr.Dataset(
@@ -128,6 +122,12 @@ def _count(what: str, folder: Path, parts: Sequence[Shard], payloads: dict[int, 
     """Return how often each pixel (y, x) of the sum was missing, or saturated; None where none was."""
     found = [load_saved(folder / f"{part.index}-{what}.npy") for part in parts if payloads[part.index][what]]
     return np.sum(found, axis=0, dtype=np.int64) if found else None
+
+
+def _is_whole(image: NDArray[np.float64], saturated: Whole | None) -> Bools:
+    """Tell which pixels (y, x) are at levels at which noise is not cut off: below those of nearly all saturated ones."""
+    limit = np.inf if saturated is None else np.quantile(image[saturated > 0], _SATURATED)
+    return np.asarray(image < limit)
 
 
 def _whole_pixels(movie: Movie, drift: xr.Dataset | None) -> tuple[NDArray[np.int64], Bools]:
