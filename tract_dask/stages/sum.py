@@ -125,7 +125,7 @@ def _count(what: str, folder: Path, parts: Sequence[Shard], payloads: dict[int, 
 
 
 def _is_whole(image: NDArray[np.float64], saturated: Whole | None) -> Bools:
-    """Tell which pixels (y, x) are at levels at which noise is not cut off: below those of nearly all saturated ones."""
+    """Tell which pixels (y, x) are at levels at which noise is not cut off: below nearly all saturated ones."""
     limit = np.inf if saturated is None else np.quantile(image[saturated > 0], _SATURATED)
     return np.asarray(image < limit)
 
