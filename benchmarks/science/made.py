@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
-from tract_dask import convert, fit_columns, open_movie
+from tract_dask import convert, fit_columns, open_movie, sum_image
 from tract_dask.settings import FitSettings, MetadataSettings
+from tract_dask.store.camera import Camera
 from tract_dask.store.columns import column_dataset
 
 Floats = NDArray[np.float64]
@@ -37,6 +39,8 @@ class Made:
         Level of the vacuum beside the crystal, as a share of the background.
     side
         The crystal has so many columns along x and along y.
+    psf_px
+        Sigma of the spread of an electron over the camera's pixels; their counts are then real numbers.
     """
 
     amplitude: float
@@ -44,6 +48,7 @@ class Made:
     sigma_px: float = 4.0
     vacuum: float = 1.0
     side: int = 14
+    psf_px: float = 0.0
 
     @property
     def n_columns(self) -> int:
@@ -78,11 +83,18 @@ class Made:
         return image
 
     def tracks(
-        self, work: Path, moved_px: Floats, there: NDArray[np.bool_] | None = None, seed: int = 0, **settings: Any
+        self,
+        work: Path,
+        moved_px: Floats,
+        there: NDArray[np.bool_] | None = None,
+        seed: int = 0,
+        camera: Camera | None = None,
+        **settings: Any,
     ) -> xr.Dataset:
         """Return the fitted tracks of a movie in which columns move by ``moved_px`` (frame, column, 2: x, y).
 
-        Fits start from the true places and shapes of columns that do not move; ``there`` (frame, column).
+        Fits start from the true places and shapes of columns that do not move; ``there`` (frame, column). ``camera``:
+        what is known of it.
         """
         rng = np.random.default_rng(seed)
         sites = self.sites(rng)
@@ -91,6 +103,8 @@ class Made:
         movie_path = work / "movie.npy"
         shown = zip(moved_px, there, strict=True)
         counts = np.stack([rng.poisson(self.frame(sites + moved, seen)).astype(np.uint16) for moved, seen in shown])
+        if self.psf_px:
+            counts = np.stack([gaussian_filter(frame.astype(np.float32), self.psf_px, mode="wrap") for frame in counts])
         np.save(movie_path, counts)
         calibration = MetadataSettings(pixel_size_pm=_PIXEL_PM, frame_time_s=1.0)
         movie = open_movie(convert(movie_path, work / f"movie_{seed}.zarr", metadata=calibration))
@@ -102,4 +116,5 @@ class Made:
         columns = columns.assign_attrs(blur_sigma_px=0.0)
         box = (8, vacuum - round(3 * self.sigma_px), 8, counts.shape[2] - 8)
         given: dict[str, Any] = {"vacuum_box": box, "refine_drift": False} | settings
-        return fit_columns(movie, columns, None, FitSettings(**given)).load()
+        summed = None if camera is None else sum_image(movie).assign_attrs(camera.to_attribute())
+        return fit_columns(movie, columns, None, FitSettings(**given), summed=summed).load()

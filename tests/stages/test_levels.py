@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from benchmarks.science.made import Made
+from tract_dask import convert, fit_columns, open_movie
 from tract_dask.analysis.presence import present
-from tract_dask.settings import FitSettings
+from tract_dask.settings import FitSettings, MetadataSettings
 from tract_dask.stages.fit.levels import Vacuum, noise_at_columns
+from tract_dask.store.camera import Camera
 from tract_dask.store.results import accepted
 from tract_dask.store.schema import REJECTED
 
@@ -42,6 +44,30 @@ def test_empty_places_pass_at_the_stated_rates(made, settings, tmp_path):
     np.testing.assert_allclose(tracks["noise"].mean(), true, rtol=0.05)
     again = accepted(tracks, FitSettings().threshold)["status"]
     np.testing.assert_array_equal(again, tracks["status"])
+
+
+def test_what_a_camera_spreads_passes_at_the_stated_rate(tmp_path):
+    """Neighbours share noise (a Gaussian of 1 px): of 2,000 places without a column 5 % pass, to 2 points."""
+    lag = np.arange(-4, 5)
+    shared = np.exp(-(lag[:, None] ** 2 + lag**2) / 4)
+    made = Made(amplitude=3.0, background=6.4, side=10, psf_px=1.0)
+    camera = Camera(correlation=tuple(map(tuple, shared.tolist())))
+    still = np.zeros((20, made.n_columns, 2))
+    tracks = made.tracks(tmp_path, still, np.zeros(still.shape[:2], bool), camera=camera)
+    good = (tracks["status"].to_numpy() & np.uint8(REJECTED)) == 0
+    assert good.mean() == pytest.approx(0.05, abs=0.02)
+
+
+def test_an_offset_is_no_level_of_the_vacuum(scene, npy, tmp_path):
+    """The same counts on an offset of 100 have the same noise, strength and status."""
+    found = []
+    for offset in (0, 100):
+        metadata = MetadataSettings(offset=float(offset))
+        path = convert(npy(scene.counts() + offset), tmp_path / f"{offset}.zarr", metadata=metadata)
+        settings = FitSettings(vacuum_box=(4, 40, 8, 136))
+        found.append(fit_columns(open_movie(path), scene.columns(), scene.drift_dataset(), settings).compute())
+    for name in ("noise", "presence", "status"):
+        np.testing.assert_allclose(found[1][name], found[0][name], rtol=1e-3)
 
 
 def test_levels_that_do_not_tell_the_noise_are_not_known():

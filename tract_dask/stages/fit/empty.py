@@ -14,7 +14,7 @@ from ...settings.run import FitSettings
 from ...store.columns import column_dataset
 from ...store.schema import REJECTED
 from .job import Job
-from .measure import Places, damping, fit_places, status_of, white_noise_left
+from .measure import Places, damping, fit_places, noise_left, status_of
 
 EMPTY_PASS = 0.05
 """Share of places without a column whose fits are accepted with the default threshold."""
@@ -42,9 +42,9 @@ def calibrated(job: Job) -> Job:
     fits = fit_places(places, Tiles(frame[None, None], np.zeros((1, 1), np.int64), frame.shape), 1.0, sample)
     passes = (status_of(fits, places, np.zeros((1, 1))) & np.uint8(REJECTED)) == 0
     amplitude = np.where(passes, np.abs(fits.estimates[..., AMPLITUDE]), 0.0)
-    noise *= white_noise_left(job.settings.noise_blur_px)
+    noise *= noise_left(job.settings.noise_blur_px, job.correlation)
     limit = float(np.quantile(amplitude, 1 - EMPTY_PASS)) / noise
-    left_over = float(np.nanmedian(damping(job.settings) * fits.residual)) / noise
+    left_over = float(np.nanmedian(damping(job) * fits.residual)) / noise
     return replace(job, scale=max(limit / FitSettings().threshold, _LEAST), left_over=left_over)
 
 
@@ -79,4 +79,23 @@ def _noise_alone(job: Job) -> tuple[Job, NDArray[np.float32], float]:
         refined_by=None,
         unit=1.0,
     )
+    if job.correlation is not None:
+        frame, share = _spread(frame, shape[0, BACKGROUND], np.array(job.correlation))
+        noise *= share
     return sample, frame, float(noise)
+
+
+def _spread(frame: NDArray[np.float32], level: float, correlation: Floats) -> tuple[NDArray[np.float32], float]:
+    """Return a frame of white noise about ``level`` as a detector of this autocorrelation shows it.
+
+    Electrons are spread over neighbours, which leaves their number; the second value is by what that makes the standard
+    deviation of a pixel smaller.
+    """
+    reach = len(correlation) // 2
+    lags = np.zeros(frame.shape)
+    lag = np.arange(-reach, reach + 1)
+    lags[np.ix_(lag % frame.shape[0], lag % frame.shape[1])] = correlation
+    power = np.maximum(np.fft.rfft2(lags).real, 0)
+    share = 1 / np.sqrt(power[0, 0])
+    spread = np.fft.irfft2(np.fft.rfft2(frame - level) * np.sqrt(power) * share, frame.shape)
+    return (level + spread).astype(np.float32), float(share)

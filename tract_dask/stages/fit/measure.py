@@ -154,16 +154,18 @@ def _noise(
     Where there is no vacuum, the noise is that of the fits' residuals. Where the level of the vacuum does not tell the
     columns' noise, it is that of the vacuum, and strengths are NaN. Those in vacuum are (frames, places).
     """
-    blur, residual, white = job.settings.noise_blur_px, fits.residual, white_noise_left(job.settings.noise_blur_px)
+    blur, residual, white = job.settings.noise_blur_px, fits.residual, noise_left(job.settings.noise_blur_px)
     if places.vacuum is None:
-        common = damping(job.settings) / job.left_over * masked_median(residual, np.isfinite(residual))
+        common = damping(job) / job.left_over * masked_median(residual, np.isfinite(residual))
         known = noise = noise_without_vacuum(common, job.reference, job.settings)
         empty = np.full((len(residual), SIZES["place"]), np.nan)
     else:
         squares, there = _squares(tiles, places.vacuum, blur, gain)
         with np.errstate(invalid="ignore"):  # pixels of bad frames
             flat = squares.reshape(len(squares), -1)
-            vacuum = Vacuum(flat.std(axis=1, dtype=np.float64) / np.sqrt(there), flat.mean(axis=1, dtype=np.float64))
+            vacuum = Vacuum(
+                flat.std(axis=1, dtype=np.float64) / np.sqrt(there), flat.mean(axis=1, dtype=np.float64) - job.floor
+            )
         known = noise_at_columns(vacuum, fits.estimates, job.reference, job.settings)
         noise = np.where(np.isfinite(known), known, vacuum.noise[:, None])
         if job.settings.window_blur_px != blur:
@@ -314,15 +316,25 @@ def _disc(size: int) -> NDArray[np.bool_]:
     return np.hypot(offset[:, None], offset) <= size / 2
 
 
-def damping(settings: FitSettings) -> float:
-    """Return by how much the blur for the noise would still reduce the noise of the windows, which is white if raw."""
+def damping(job: Job) -> float:
+    """Return by how much the blur for the noise would still reduce the noise of the windows."""
+    settings = job.settings
     still = settings.window_blur_px < settings.noise_blur_px
-    return white_noise_left(settings.noise_blur_px) if still else 1.0
+    return noise_left(settings.noise_blur_px, job.correlation) if still else 1.0
 
 
-def white_noise_left(sigma: float) -> float:
-    """Return the share of white noise's standard deviation that the blur of pixels by ``sigma`` px leaves."""
-    return float((gaussian_kernel(sigma) ** 2).sum())
+def noise_left(sigma: float, correlation: Sequence[Sequence[float]] | None = None) -> float:
+    """Return the share of the noise's standard deviation that the blur of pixels by ``sigma`` px leaves.
+
+    ``correlation`` is the autocorrelation of the pixels' noise, None where they share none.
+    """
+    kernel = gaussian_kernel(sigma).astype(np.float64)
+    if correlation is None:
+        return float(kernel @ kernel)
+    lags = np.convolve(kernel, kernel)
+    spread = [np.convolve(row, lags) for row in np.asarray(correlation)]
+    along_y = np.convolve(np.array(spread)[:, len(spread[0]) // 2], lags)
+    return math.sqrt(max(0.0, float(along_y[len(along_y) // 2])))
 
 
 def _bounds(places: Places, job: Job) -> tuple[Floats, Floats, Floats]:
