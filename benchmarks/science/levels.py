@@ -64,7 +64,7 @@ def _of(made: Made, work: Path) -> dict[str, str]:
     told = states(tracks).to_numpy()
     found["columns that are never there, and are at 95 % by `states`"] = share(told[:, never].any(axis=0))
     gone = kinds == 1
-    found["absences of eight frames that `states` sees"] = share((~told[AWAY][:, gone]).mean(axis=0) > 0.5)
+    found["absences of eight frames that `states` sees"] = share(np.asarray((~told[AWAY][:, gone]).mean(axis=0) > 0.5))
     return found
 
 
