@@ -47,7 +47,7 @@ def _of(made: Made, work: Path) -> dict[str, str]:
     found = {f"still columns with a jump at {level:.0%}": _jumped(still, level) for level in (0.9, 0.95, 0.99)}
     pairs = [displacement(still, first, first + 20)["p_value"].to_numpy() for first in range(0, 20, 2)]
     p_values = np.concatenate(pairs)
-    found["still columns that moved, p < 5 %"] = share(np.asarray(p_values[np.isfinite(p_values)] < 0.05))
+    found["still columns that moved, p < 5 %"] = share(p_values[np.isfinite(p_values)] < 0.05)
     moved, there = motion(made, still)
     kinds = np.arange(made.n_columns) % 3
     tracks = made.tracks(work, moved, there, seed=2)
@@ -62,9 +62,9 @@ def _of(made: Made, work: Path) -> dict[str, str]:
         found[f"`present` at {rate:.0%} where there is no column"] = share(seen[:, never])
     found["`present` at 1 % where there is one"] = share(seen[:, ~never][there[:, ~never]])
     told = states(tracks).to_numpy()
-    found["columns that are never there, and are at 95 % by `states`"] = share(told[:, never].any(axis=0))
+    found["columns that are never there, and are at 95 % by `states`"] = share(np.asarray(told[:, never].any(axis=0)))
     gone = kinds == 1
-    found["absences of eight frames that `states` sees"] = share(np.asarray((~told[AWAY][:, gone]).mean(axis=0) > 0.5))
+    found["absences of eight frames that `states` sees"] = share((~told[AWAY][:, gone]).mean(axis=0) > 0.5)
     return found
 
 
