@@ -239,6 +239,17 @@ def test_kernels_know_only_numpy_and_numba(file):
     assert outside - set(sys.stdlib_module_names) <= ABROAD
 
 
+@pytest.mark.parametrize("room", ["store", "readers", "cluster", "stages"])
+def test_what_every_run_imports_is_small(room):
+    """These parts of SciPy take as long to import as a small movie takes to be tracked."""
+    slow = {f"scipy.{name}" for name in ("signal", "stats", "optimize", "interpolate")} | {"matplotlib", "skimage"}
+    for file in (PACKAGE / room).rglob("*.py"):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            named = {node.module} if isinstance(node, ast.ImportFrom) else set()
+            named |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+            assert not named & slow, file
+
+
 def test_the_architecture_page_shows_the_table():
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = [f"| `{room}` | {', '.join(f'`{other}`' for other in others) or '–'} |" for room, others in ALLOWED.items()]

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 from scipy.special import gammaincc
 
 from ...kernels.gaussian.information import model_slopes
@@ -84,17 +83,29 @@ def freedom(column: Floats, size: int, settings: FitSettings, shared: Floats | N
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
     lags = np.convolve(kernel, kernel)
     common = np.outer(lags, lags)
-    common = common if shared is None else fftconvolve(common, shared)
+    common = common if shared is None else _convolved(common, shared, whole=True)
     common /= common[len(common) // 2, len(common) // 2]
     one, two, three = _cumulants(basis, weight, common)
     return Freedom(one**2 / two, two**3 / three**2, 1 / (2 * float((common**2).sum())))
+
+
+def _convolved(images: Floats, kernel: Floats, *, whole: bool = False) -> Floats:
+    """Return images (..., y, x) convolved with a kernel (odd, odd): as large as they are, or the whole result."""
+    sides = [a + b - 1 for a, b in zip(images.shape[-2:], kernel.shape, strict=True)]
+    room = [-(-side // 8) * 8 for side in sides]  # a fast length
+    product = np.fft.irfft2(np.fft.rfft2(images, room) * np.fft.rfft2(kernel, room), room)
+    rows, across = (
+        slice(0 if whole else k // 2, side if whole else k // 2 + n)
+        for k, n, side in zip(kernel.shape, images.shape[-2:], sides, strict=True)
+    )
+    return np.asarray(product[..., rows, across], np.float64)
 
 
 def _cumulants(basis: Floats, weight: Floats, common: Floats) -> tuple[float, float, float]:
     """Return the traces of P C and its square and third power; C is weight * common * weight."""
 
     def covariance(images: Floats) -> Floats:
-        return weight * fftconvolve(weight * images, common[None], mode="same", axes=(1, 2))
+        return weight * _convolved(weight * images, common)
 
     def left(images: Floats) -> Floats:
         flat, own = images.reshape(len(images), -1), basis.reshape(len(basis), -1)
@@ -104,7 +115,7 @@ def _cumulants(basis: Floats, weight: Floats, common: Floats) -> tuple[float, fl
     followed = covariance(basis)
     inner = followed.reshape(len(basis), -1) @ basis.reshape(len(basis), -1).T
     one = float(power.sum() - np.trace(inner))
-    every = float((power * fftconvolve(power, common**2, mode="same")).sum())
+    every = float((power * _convolved(power, common**2)).sum())
     two = every - 2 * float((followed**2).sum()) + float((inner**2).sum())
     signs = left(np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, *weight.shape)))
     once = left(covariance(signs))
