@@ -105,7 +105,7 @@ def parts_of_fit(outputs: RunFolder) -> list[list[loops.Part]]:
     about, array = metadata.attributes(outputs.results), datasets.open_array(outputs.movie / "0")
     tracks = tract_dask.open_results(outputs.results)
     places = np.stack([tracks["y_ref"].to_numpy(), tracks["x_ref"].to_numpy()], axis=1)
-    margin = gaussian_kernel(FitSettings().blur_sigma_px).size // 2
+    margin = gaussian_kernel(tracks.attrs["window_blur_px"]).size // 2
     assert array.shards is not None
     parts = []
     for shard in split(array.shape[0], array.shards[0]):

@@ -126,7 +126,7 @@ def make(path: Path) -> None:
         pixel_size_pm=_PIXEL_PM,
         frame_time_s=_FRAME_TIME_S,
         dose=_DOSE,
-        settings=to_toml(FitSettings()),
+        settings=to_toml(FitSettings(blur_sigma_px=2.0)),
         window=round(table.attrs["window_pm"] / _PIXEL_PM),
         reference_blur_px=2.0,
     )

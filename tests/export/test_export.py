@@ -44,7 +44,7 @@ def store(scene, tmp_path):
         4,
         pixel_size_pm=4.0,
         frame_time_s=0.1,
-        settings=to_toml(FitSettings()),
+        settings=to_toml(FitSettings(blur_sigma_px=2.0)),
         window=19,
         reference_blur_px=2.0,
     )

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
-from tract_dask.kernels.gaussian.fit import SMALLEST_SIGMA_PX, Outcome, fit_gaussians
+from tract_dask.kernels.gaussian.fit import Outcome, fit_gaussians, smallest_sigma
 from tract_dask.kernels.gaussian.model import blurred, canonical, evaluate, gaussian_image
 
 NOISE_FREE_PX = 1e-4
@@ -409,7 +409,7 @@ def test_windows_without_a_column_give_finite_estimates_within_bounds(spoil):
     estimates = fits.estimates
     assert np.isfinite(estimates).all()
     assert ((estimates >= lower) | (np.arange(7) == 5)).all()
-    assert (estimates[:, 4] >= SMALLEST_SIGMA_PX).all()
+    assert (estimates[:, 4] >= smallest_sigma(SIZE)).all()
     assert np.isfinite(fits.r_squared).all()
 
 

@@ -147,3 +147,11 @@ def test_a_mask_that_is_wrong_is_not_made_where_it_is_not_wanted(tmp_path, npy):
         left.append(open_movie(path).pixels)
     assert sum(left[0].counts(frames.shape[1:]).values()) >= 4 * frames.shape[1]
     assert not left[1]
+
+
+def test_columns_need_pixels_that_are_small_enough(tmp_path):
+    made = Run(tmp_path)
+    known = survey(made.write(), [])
+    for sigma, narrow in ((0.7, True), (0.85, False)):
+        run = replace(known, found=known.found | {"sigma_px": sigma})
+        assert ("undersampled" in {finding.name for finding in findings(run)}) == narrow

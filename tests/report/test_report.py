@@ -96,7 +96,7 @@ class Run:
             self.values["drift_measured"],
             self.values["time"],
             N_FRAMES,
-            settings=to_toml(self.settings.fit),
+            settings=to_toml(dataclasses.replace(self.settings.fit, blur_sigma_px=2.0)),
             window=19,
             reference_blur_px=2.0,
             created="2026-11-22T08:00:00+00:00",

@@ -147,7 +147,7 @@ def test_version_0_is_what_the_settings_find(service: Service) -> None:
         (row["column_id"], row["x"], row["y"]) for row in rows(service.found)
     ]
     assert table["spacing_px"] == pytest.approx(SPACING, abs=0.05)
-    blurred = 5 * SIGMA**2 / (SIGMA**2 + 2.0**2)  # by the 2 px with which frames are fitted
+    blurred = 5 * SIGMA**2 / (SIGMA**2 + 1.0**2)  # by the 1 px with which frames are fitted
     assert table["columns"][6]["amplitude"] == pytest.approx(blurred, rel=0.01)
 
 

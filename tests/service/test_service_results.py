@@ -74,7 +74,7 @@ class Fits:
             np.zeros((N_FRAMES, 2)),
             np.arange(N_FRAMES) * FRAME_S,
             STEP,
-            **provenance(KEY, FitSettings(), "movie.zarr"),
+            **provenance(KEY, FitSettings(blur_sigma_px=2.0), "movie.zarr"),
             **about,
             reference_blur_px=2.0,
             refine_columns=10,

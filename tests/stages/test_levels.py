@@ -7,6 +7,7 @@ from benchmarks.science.made import Made
 from tract_dask import convert, fit_columns, open_movie
 from tract_dask.analysis.presence import present
 from tract_dask.settings import FitSettings, MetadataSettings
+from tract_dask.stages.columns.window_size import default_blur
 from tract_dask.stages.fit.levels import Vacuum, noise_at_columns
 from tract_dask.store.camera import Camera
 from tract_dask.store.results import accepted
@@ -40,7 +41,7 @@ def test_empty_places_pass_at_the_stated_rates(made, settings, tmp_path):
     for rate in (0.1, 0.01):
         assert within(present(tracks, rate).to_numpy()[empty].mean(), rate)
     assert good[there].mean() >= 0.98
-    true = np.sqrt(made.background) / (2 * np.sqrt(np.pi) * 2.0)
+    true = np.sqrt(made.background) / (2 * np.sqrt(np.pi) * default_blur(made.sigma_px))
     np.testing.assert_allclose(tracks["noise"].mean(), true, rtol=0.05)
     again = accepted(tracks, FitSettings().threshold)["status"]
     np.testing.assert_array_equal(again, tracks["status"])
@@ -77,7 +78,7 @@ def test_levels_that_do_not_tell_the_noise_are_not_known():
     reference[1, 6] = 4.0
     estimates[:, 1, 6] = 4.0
     vacuum = Vacuum(np.full(3, 0.5), np.array([1.0, 0.001, -0.2]))
-    found = noise_at_columns(vacuum, estimates, reference, FitSettings())
+    found = noise_at_columns(vacuum, estimates, reference, FitSettings(blur_sigma_px=2.0))
     np.testing.assert_allclose(found, [[0.5, 1.0], [np.nan, np.nan], [np.nan, np.nan]])
-    same = noise_at_columns(vacuum, estimates, reference, FitSettings(counting=False))
+    same = noise_at_columns(vacuum, estimates, reference, FitSettings(counting=False, blur_sigma_px=2.0))
     np.testing.assert_allclose(same, 0.5)

@@ -66,6 +66,7 @@ BRIGHT, DARK, MODEST = (30.0, 10.0), (-50.0, 100.0), (20.0, 20.0)
         *(Row(spacing, *BRIGHT, {"blur_sigma_px": min(2.0, 0.06 * spacing)}) for spacing in (12, 16, 24, 36, 80)),
         *(Row(spacing, *DARK, {"blur_sigma_px": min(2.0, 0.06 * spacing)}) for spacing in (16, 36)),
         *(Row(spacing, *MODEST, {"estimator": "poisson"}) for spacing in (16, 36)),
+        *(Row(spacing, *BRIGHT, {"estimator": name}) for spacing in (5.4, 8.0) for name in ("lsq", "poisson")),
         Row(24, *BRIGHT, {"blur_sigma_px": 2.0}),
         Row(36, *BRIGHT, {"filter": "none"}),
     ],

@@ -146,7 +146,7 @@ def test_standard_errors_are_those_of_the_scatter(scene, tracks, estimator, ligh
 
 
 def test_a_fixed_shape_is_that_of_the_summed_image(scene, tracks):
-    fits = tracks()
+    fits = tracks(blur_sigma_px=2.0)
     reference = scene.columns()["fit_ref"].to_numpy()
     np.testing.assert_allclose(
         fits["fit"][..., 3:6], np.broadcast_to(reference[:, 3:6], (12, *reference[:, 3:6].shape))

@@ -460,7 +460,7 @@ def test_results_are_few_files_that_any_reader_opens(scene, tmp_path):
     place, columns, rng = tmp_path / "results.zarr", scene.columns(), np.random.default_rng(0)
     sizes = {"frame": 199, "column_id": columns.sizes["column_id"]} | schema.SIZES
     values = {name: rng.random([sizes[dim] for dim in schema.RESULTS[name].dims]) for name in parts.SHARDED}
-    about = {"key": "key", "settings": to_toml(FitSettings()), "window": 19, "reference_blur_px": 2.0}
+    about = {"key": "key", "settings": to_toml(FitSettings(blur_sigma_px=2.0)), "window": 19, "reference_blur_px": 2.0}
     results.create(place, columns, np.zeros((199, 2)), np.arange(199.0), 2, **about)
     store_fits(place, values, 2)
     assert sum(1 for _ in place.rglob("*")) < 1.2 * 100

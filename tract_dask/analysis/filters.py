@@ -98,7 +98,11 @@ def compare_filters(
         compared[f"{name}_difference"] = (compared[name] - plain[name]).assign_attrs(units="px")
     change = 100 * (compared["intensity"] / plain["intensity"] - 1)
     compared["intensity_difference"] = change.assign_attrs(units="%")
-    compared.attrs = {"pixel_size_pm": movie.pixel_size_pm, "window_px": job.window_px}
+    compared.attrs = {
+        "pixel_size_pm": movie.pixel_size_pm,
+        "window_px": job.window_px,
+        "blur_sigma_px": job.settings.blur_sigma_px,
+    }
     return compared
 
 
@@ -203,6 +207,8 @@ def filtered_region(
     The coordinates are pixels of the frame. Whole frames are filtered, then cut.
     """
     settings = settings or FitSettings()
+    if settings.blur_sigma_px is None:
+        settings = dataclasses.replace(settings, blur_sigma_px=compared.attrs["blur_sigma_px"])
     margin = _MARGIN * compared.attrs["window_px"]
     spans = []
     for axis, length in (("y", movie.shape[1]), ("x", movie.shape[2])):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import SettingsError
 from ..kernels.gaussian.intensity import INTENSITY_SCALE, intensities
 from ..kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B
-from ..settings.run import FitSettings
+from ..stages.columns.window_size import resolve_blur
 from ..stages.fit.vacuum import check_box, find_vacuum
 from ..store import schema
 from ..store.movie import Movie
@@ -114,7 +114,7 @@ def vacuum_level(
     *,
     columns: xr.Dataset | None = None,
     drift: xr.Dataset | None = None,
-    blur_sigma_px: float = FitSettings().blur_sigma_px,
+    blur_sigma_px: float | None = None,
 ) -> xr.Dataset:
     """Return the mean of a large box in the vacuum, far from the particle.
 
@@ -124,7 +124,9 @@ def vacuum_level(
         The summed image (:func:`tract_dask.sum_image`), for the mean over all frames; or a movie, for each frame.
     box
         (y0, y1, x0, x1) in the summed image, px. None, for a summed image: the largest flat square, as the fit finds it
-        (:func:`tract_dask.stages.fit.vacuum.find_vacuum`), for which ``columns`` and ``blur_sigma_px`` are needed.
+        (:func:`tract_dask.stages.fit.vacuum.find_vacuum`), for which ``columns`` are needed.
+    blur_sigma_px
+        Of that search; None: as the columns are fitted by default.
     drift
         From :func:`tract_dask.estimate_drift`, for a movie: the box moves with it, by whole pixels.
 
@@ -325,8 +327,8 @@ def _root_mean_square(values: xr.DataArray) -> xr.DataArray:
     return (values**2).mean("frame") ** 0.5
 
 
-def _found(summed: xr.Dataset, columns: xr.Dataset | None, blur_sigma_px: float) -> tuple[int, int, int, int]:
-    box = None if columns is None else find_vacuum(summed, columns, blur_sigma_px)
+def _found(summed: xr.Dataset, columns: xr.Dataset | None, blur_sigma_px: float | None) -> tuple[int, int, int, int]:
+    box = None if columns is None else find_vacuum(summed, columns, resolve_blur(blur_sigma_px, columns))
     if box is None:
         raise SettingsError(
             "no vacuum is known",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +19,11 @@ from ..kernels.gaussian.information import column_bounds
 from ..kernels.gaussian.intensity import Floats, intensities
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
-from ..kernels.windows import cut_windows
+from ..kernels.windows import blur_variance, cut_windows
 from ..settings.run import ColumnSettings, FitSettings
 from ..stages.columns.contrast import SIGNS
 from ..stages.columns.find import find_columns
-from ..stages.columns.window_size import neighbour_distance, resolve_window
+from ..stages.columns.window_size import neighbour_distance, resolve_blur, resolve_window
 from ..store.columns import column_dataset, positions
 from ..store.files import read_small, write_aside
 from ..store.schema import REJECTED
@@ -109,6 +110,9 @@ def look_up_table(
     spacing = None if settings.window_px else neighbour_distance(positions(scenes[0]))
     window_px = resolve_window(settings.window_px, pages.shape[1:], spacing)
     pairs = list(zip(pages, scenes, strict=True))
+    if settings.blur_sigma_px is None:
+        blur = resolve_blur(None, _found(pages[-1], scenes[-1], window_px, settings, contrast))
+        settings = dataclasses.replace(settings, blur_sigma_px=blur)
     tries = [contrast] if contrast != "auto" else list(SIGNS)
     measured = [
         np.concatenate([_measured(page, scene, window_px, settings, own) for page, scene in pairs]) for own in tries
@@ -244,16 +248,8 @@ def _atoms(scene: xr.Dataset, number: int) -> NDArray[np.int64]:
 
 def _measured(image: Floats, columns: xr.Dataset, window_px: int, settings: FitSettings, contrast: str) -> Floats:
     """Return the fits of the columns of an image, (columns, 7); NaN where a fit is not accepted or left its column."""
-    summed = xr.Dataset({"image": (("y", "x"), image), "exposure": (("y", "x"), np.ones(image.shape, np.uint32))})
     reach = max(1.0, _REACH * window_px)
-    found = find_columns(
-        summed,
-        ColumnSettings(contrast=contrast, search_radius_px=reach, centroid_radius_px=reach),
-        seeds=column_dataset(positions(columns), column_id=columns["column_id"]),
-        blur_sigma_px=settings.blur_sigma_px if settings.estimator == "poisson" else settings.window_blur_px,
-        window_px=window_px,
-    )
-    found = found[["fit_ref", "status_ref"]].reindex(
+    found = _found(image, columns, window_px, settings, contrast)[["fit_ref", "status_ref"]].reindex(
         column_id=columns["column_id"], fill_value={"status_ref": REJECTED}
     )
     fit = found["fit_ref"].to_numpy().copy()
@@ -265,9 +261,23 @@ def _measured(image: Floats, columns: xr.Dataset, window_px: int, settings: FitS
     return fit
 
 
+def _found(image: Floats, columns: xr.Dataset, window_px: int, settings: FitSettings, contrast: str) -> xr.Dataset:
+    """Return the columns of an image, found from where they are."""
+    summed = xr.Dataset({"image": (("y", "x"), image), "exposure": (("y", "x"), np.ones(image.shape, np.uint32))})
+    reach = max(1.0, _REACH * window_px)
+    is_blurred = settings.estimator == "poisson" or settings.filter == "gaussian"
+    return find_columns(
+        summed,
+        ColumnSettings(contrast=contrast, search_radius_px=reach, centroid_radius_px=reach),
+        seeds=column_dataset(positions(columns), column_id=columns["column_id"]),
+        blur_sigma_px=settings.blur_sigma_px if is_blurred else 0.0,
+        window_px=window_px,
+    )
+
+
 def _likeliest(image: Floats, reference: Floats, window_px: int, settings: FitSettings) -> Floats:
     """Return fits by maximum likelihood to the raw pixels, (n, 7), started from fits to the blurred ones."""
-    start = blurred(reference, -(settings.blur_sigma_px**2))
+    start = blurred(reference, -blur_variance(settings.noise_blur_px))
     corner = np.rint(start[:, [Y, X]]).astype(np.int64) - window_px // 2
     start[:, [Y, X]] -= corner
     room = np.array([5 * np.abs(start[:, AMPLITUDE]), *np.full((2, len(start)), _REACH * window_px)])
@@ -300,7 +310,7 @@ def _values(
     table = _by_site(area * intensity, atoms, site, "look_up_table")
     electrons = fits.copy()
     electrons[:, [AMPLITUDE, BACKGROUND]] *= area  # at 1 e/A^2
-    sharp = blurred(electrons, -(settings.window_blur_px**2))
+    sharp = blurred(electrons, -blur_variance(settings.window_blur_px))
     bound = intensity_bound(sharp, window_px, fixed_shape=settings.shape == "fixed")
     for name, variance in (("variance_poisson", area * error**2), ("variance_fit", (bound * area * intensity) ** 2)):
         values = [np.nanmean(variance[atoms == n]) for n in table["atoms"].to_numpy()]

@@ -17,6 +17,7 @@ from ..errors import SettingsError
 from ..kernels.gaussian.intensity import intensities
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import AMPLITUDE
+from ..kernels.windows import blur_variance
 from ..settings.run import FitSettings
 from ..store.results import accepted, fitted_with, weakest
 from ..store.schema import NOT_SEEN, Status
@@ -318,10 +319,10 @@ def _reference(tracks: xr.Dataset, noise_scale: float) -> xr.Dataset:
     """
     fits = tracks["fit_ref"].to_numpy().astype(np.float64)
     fits = np.where(np.isnan(fits), np.nanmedian(fits, axis=0), fits)
-    sharp = blurred(fits, -(fitted_with(tracks, "reference_blur_px") ** 2))
+    sharp = blurred(fits, -blur_variance(fitted_with(tracks, "reference_blur_px")))
     window_px, held = fitted_with(tracks, "window_px"), fitted_with(tracks, "shape") == "fixed"
     fixed, free = (intensity_bound(sharp, window_px, fixed_shape=fixed_shape) for fixed_shape in (True, False))
-    as_fitted = blurred(sharp, fitted_with(tracks, "window_blur_px") ** 2)
+    as_fitted = blurred(sharp, blur_variance(fitted_with(tracks, "window_blur_px")))
     intensity = np.abs(intensities(as_fitted, fitted_with(tracks, "intensity_scale"))[0])
     common = np.sqrt(np.maximum(free**2 - fixed**2, 0) / tracks.sizes["frame"])
     values = {

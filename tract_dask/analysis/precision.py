@@ -14,6 +14,7 @@ from ..errors import InputError, SettingsError
 from ..kernels.gaussian.information import column_bounds
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
+from ..kernels.windows import blur_variance
 from ..store.results import fitted_with
 from .motion import dose_of, named, pixel_size_pm, positions, spread, standard_deviation, standard_errors
 
@@ -203,7 +204,7 @@ def cramer_rao(tracks: xr.Dataset) -> xr.DataArray:
 def _columns_as_they_are(tracks: xr.Dataset) -> NDArray[np.float64]:
     """Return the columns in the summed image without its blur, (column_id, parameter); NaN where it was not fitted."""
     fits = tracks["fit_ref"].to_numpy().astype(np.float64)
-    return blurred(fits, -(fitted_with(tracks, "reference_blur_px") ** 2))
+    return blurred(fits, -blur_variance(fitted_with(tracks, "reference_blur_px")))
 
 
 def _of_columns(tracks: xr.Dataset, values: NDArray[np.float64], description: str) -> xr.DataArray:

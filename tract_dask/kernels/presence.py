@@ -26,7 +26,7 @@ from .gaussian.model import blurred, evaluate
 from .gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from .vectors.simd import load, load_at, store, vector
 from .vectors.tracing import LANES
-from .windows import gaussian_kernel
+from .windows import blur_variance, gaussian_kernel
 
 Array = NDArray[Any]
 
@@ -89,7 +89,7 @@ def _weights(
 ) -> NDArray[np.float64]:
     """Return the weights (n, rows, columns) at some rows of the windows, which are counted from the middle one."""
     disc = np.hypot(rows[:, None], columns) <= len(columns) / 2
-    narrow = blurred(parameters, -2 * blur_sigma_px**2)
+    narrow = blurred(parameters, -2 * blur_variance(blur_sigma_px))
     narrow[:, [AMPLITUDE, X, Y, BACKGROUND]] = np.sign(narrow[:, [AMPLITUDE]]) * [1, 0, 0, 0]
     shape = evaluate(narrow, columns, rows[:, None])
     weights = np.where(disc, shape - shape[:, disc].mean(axis=1)[:, None, None], 0.0)

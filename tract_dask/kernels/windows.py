@@ -70,6 +70,18 @@ def gaussian_kernel(sigma: float, truncate: float = 4.0) -> npt.NDArray[np.float
     return normalised
 
 
+def blur_variance(sigma: float) -> float:
+    """Return the variance of the weights of a Gaussian blur along an axis, px^2: below 0.7 px less than sigma^2.
+
+    Examples
+    --------
+    >>> [round(blur_variance(sigma), 3) for sigma in (0.25, 0.5, 1.0, 2.0)]
+    [0.001, 0.215, 1.0, 3.999]
+    """
+    kernel = gaussian_kernel(sigma).astype(np.float64)
+    return float(kernel @ (np.arange(kernel.size) - kernel.size // 2) ** 2.0)
+
+
 def blur(image: Array, sigma: float) -> npt.NDArray[np.float32]:
     """Return the image blurred with a circular Gaussian, as ``scipy.ndimage.gaussian_filter(mode="nearest")`` does.
 

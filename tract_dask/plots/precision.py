@@ -18,6 +18,7 @@ from ..errors import SettingsError
 from ..kernels.gaussian.intensity import Floats
 from ..kernels.gaussian.model import blurred
 from ..kernels.gaussian.parameters import SIGMA_A, SIGMA_B, THETA
+from ..kernels.windows import blur_variance
 from ..store.columns import positions
 from .base import (
     COLUMN_INCHES,
@@ -104,7 +105,7 @@ def plot_fwhm(tracks: xr.Dataset, summed: xr.Dataset, path: str | Path | None = 
         raise SettingsError(
             "the blur of the summed image is not known", "plot_fwhm", "the attribute blur_sigma_px", "none"
         )
-    fits = blurred(tracks["fit_ref"].to_numpy().astype(np.float64), -(float(blur) ** 2))
+    fits = blurred(tracks["fit_ref"].to_numpy().astype(np.float64), -blur_variance(float(blur)))
     width = _FWHM * size * np.sqrt(fits[:, SIGMA_A] * fits[:, SIGMA_B])
     scale = scale_of(width)
     figure, (axes,) = image_panels(summed)

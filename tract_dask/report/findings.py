@@ -47,6 +47,8 @@ RIVAL = 0.5
 """Share of the support for one contrast that the other one may have."""
 DOUBTFUL, MANY_DOUBTFUL = 0.2, 0.5
 """Share of the columns whose fits on the summed image may be flagged: where the spacing was given, and always."""
+NARROW_PX = 0.8
+"""Sigma of columns, px, below which the integral over a pixel counts."""
 SPACINGS = 0.6, 1.6
 """Distance of the columns, in periods of the image, between which it may be."""
 MASKED = 0.01
@@ -209,6 +211,14 @@ def _found(run: Survey) -> Iterator[Finding]:
         )
         remedy = "Look at the columns in the summed image. Give --contrast, or --spacing-px, or the columns themselves."
         yield Finding("doubtful_columns", "Most columns are in doubt", text, remedy)
+    sigma = run.found.get("sigma_px")
+    if sigma and sigma < NARROW_PX:
+        text = (
+            f"The columns have a sigma of {sigma:.2g} px: too few pixels for their places, which are drawn to the "
+            "middles of pixels by a hundredth of a pixel and more."
+        )
+        remedy = "Record with smaller pixels, or convert without --bin."
+        yield Finding("undersampled", "Columns are narrower than the pixels can tell", text, remedy)
     period, apart = run.found.get("lattice_px"), run.found.get("spacing_px")
     given = run.settings.columns.spacing_px if run.settings else None
     too_near = period and given and given < SPACINGS[0] * period and doubtful > DOUBTFUL
@@ -348,9 +358,10 @@ def _why_no_errors(run: Survey) -> tuple[str, str]:
     if fit is None or fit.filters_frames:
         text = "The fits state no errors of the positions; after the filters wiener and tv-l1 they are not known."
         return text, "Take the spread of columns that keep still, or run again with --filter gaussian."
+    about = run.tracks.attrs
     text = (
-        f"The fits state no errors of the positions: after a blur of {fit.window_blur_px:g} px too few pixels are "
-        f"independent in a window that is {run.tracks.attrs['window_px']} px across."
+        f"The fits state no errors of the positions: after a blur of {about['window_blur_px']:g} px too few pixels are "
+        f"independent in a window that is {about['window_px']} px across."
     )
     return text, "Take a smaller --blur-sigma-px, a larger --window-px, or a smaller --bin."
 

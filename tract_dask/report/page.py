@@ -341,6 +341,7 @@ def measured(run: Survey) -> list[tuple[str, str]]:
         "Counts for one detector unit": f"{movie['gain']:g}" if "gain" in movie else None,
         "Columns": f"{run.columns.sizes['column_id']:,}" + (f" ({', '.join(kinds)})" if kinds else ""),
         "Window of a fit": f"{known['window_px']} px across",
+        "Blur before the fit": f"{known['window_blur_px']:g} px" if known.get("window_blur_px") else None,
         "Fitted by": {"lsq": "least squares on filtered pixels", "poisson": "maximum likelihood of counts"}.get(
             known["estimator"], known["estimator"]
         )

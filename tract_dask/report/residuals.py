@@ -51,8 +51,8 @@ def residuals(
     """
     fit = tracks["fit_ref"].to_numpy().astype(np.float64)
     size, sigma = int(tracks.attrs["window_px"]), float(tracks.attrs["reference_blur_px"])
-    of_sum = replace(settings.fit if settings else FitSettings(), shape="free", estimator="lsq", filter="none")
-    of_sum = replace(of_sum, filter="gaussian", blur_sigma_px=sigma) if sigma > 0 else of_sum
+    of_sum = replace(settings.fit if settings else FitSettings(), shape="free", estimator="lsq", filter="gaussian")
+    of_sum = replace(of_sum, blur_sigma_px=sigma)
     dark, kernel = float(tracks.attrs.get("dark_variance") or 0.0), gaussian_kernel(sigma).astype(np.float64)
     squares, ratio = np.full((2, len(fit)), np.nan)
     for k, (_, model, left) in enumerate(residual_windows(tracks, summed, range(len(fit)))):

@@ -159,6 +159,8 @@ def _columns(path: Path) -> dict[str, Any]:
         **_kinds(columns),
         "spacing, px": columns.attrs.get("spacing_px"),
         "window, px": columns.attrs.get("window_px"),
+        "blur, px": columns.attrs.get("blur_sigma_px"),
+        "sigma of a column, px": columns.attrs.get("sigma_px"),
         "outside the frame": int(((columns["status_ref"] & int(schema.Status.OUTSIDE_FRAME)) > 0).sum()),
         "edited by hand": metadata.attributes(path).get("edited", False),
     }
@@ -176,6 +178,7 @@ def _results(path: Path) -> dict[str, Any]:
         **_kinds(results),
         **{name.replace("_", " "): value for name, value in about.get("summary", {}).items()},
         "window, px": about.get("window"),
+        "blur before the fit, px": results.attrs.get("window_blur_px"),
         "pixel size, pm": about.get("pixel_size_pm"),
     }
 

@@ -22,6 +22,7 @@ from ..readers.source import FrameSource
 from ..settings.run import RunSettings
 from ..settings.toml import to_toml
 from ..stages.columns.stage import check_edited, clear_columns, columns_stage
+from ..stages.columns.window_size import resolve_blur
 from ..stages.convert.origin import is_movie_of
 from ..stages.convert.references import check_references
 from ..stages.convert.stage import convert_stage
@@ -282,6 +283,7 @@ def _resolved(movie: Movie, columns: xr.Dataset, outputs: RunFolder) -> dict[str
         "metadata.dose": movie.dose,
         "columns.spacing_px": columns.attrs.get("spacing_px"),
         "fit.window_px": about.get("window"),
+        "fit.blur_sigma_px": resolve_blur(None, columns),
         "fit.vacuum_box": about.get("vacuum"),
     }
     return {name: metadata.json_ready(value) for name, value in found.items() if value is not None}

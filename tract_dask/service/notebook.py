@@ -83,7 +83,7 @@ def edit_columns(
     columns: xr.Dataset | str | Path | None = None,
     settings: ColumnSettings | None = None,
     *,
-    blur_sigma_px: float = 2.0,
+    blur_sigma_px: float | None = None,
     window_px: int | None = None,
     browser: bool = False,
     on_saved: Callable[[xr.Dataset], object] | None = None,

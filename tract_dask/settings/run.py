@@ -192,9 +192,10 @@ class FitSettings(Settings):
         choices=("gaussian", "wiener", "tv-l1", "none"),
         common=True,
     )
-    blur_sigma_px: float = setting(
-        2.0,
-        "Sigma of the Gaussian blur before columns, noise and lsq fits (the paper's 2 px); 0: no blur",
+    blur_sigma_px: float | None = setting(
+        None,
+        "Sigma of the Gaussian blur before columns, noise and lsq fits (paper: 2); unset: about 0.4 of the columns'"
+        " sigma, as 0, 0.5, 1 or 2 px; 0: no blur",
         unit="px",
         low=0,
         high=20,
@@ -284,12 +285,18 @@ class FitSettings(Settings):
     @property
     def window_blur_px(self) -> float:
         """Sigma of the blur that windows go through before they are fitted: none where counts are."""
-        return 0.0 if self.estimator == "poisson" or self.filter != "gaussian" else self.blur_sigma_px
+        return 0.0 if self.estimator == "poisson" or self.filter != "gaussian" else self._known_blur_px
 
     @property
     def noise_blur_px(self) -> float:
         """Sigma of the blur before the noise is measured: none where whole frames are filtered."""
-        return 0.0 if self.filters_frames else self.blur_sigma_px
+        return 0.0 if self.filters_frames else self._known_blur_px
+
+    @property
+    def _known_blur_px(self) -> float:
+        if self.blur_sigma_px is None:
+            raise ValueError("the blur follows the columns: their sigma is needed first")
+        return self.blur_sigma_px
 
 
 @dataclass(frozen=True)

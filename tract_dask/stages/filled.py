@@ -17,7 +17,7 @@ from scipy.special import log_ndtr
 from ..kernels.filling import fill_near
 from ..kernels.gaussian.model import blurred, evaluate
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
-from ..kernels.windows import cut_windows, gaussian_kernel
+from ..kernels.windows import blur_variance, cut_windows, gaussian_kernel
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -139,7 +139,7 @@ def _ahead(now: Floats, step: Floats, last: Floats) -> Floats:
 
 def _before(estimates: Floats, blur_sigma_px: float, margin: int, side: int) -> Windows:
     """Return what fits expect before the blur, (n, side, side)."""
-    raw = blurred(estimates, -(blur_sigma_px**2))
+    raw = blurred(estimates, -blur_variance(blur_sigma_px))
     raw[:, [X, Y]] += margin
     return evaluate(raw, np.arange(side), np.arange(side)[:, None]).astype(np.float32)
 

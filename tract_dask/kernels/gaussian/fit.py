@@ -9,15 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..windows import gaussian_kernel
+from ..windows import blur_variance, gaussian_kernel
 from .covariance import Noise
 from .engine import Options, Problem, fit_windows
+from .moments import REACH
 from .parameters import THETA
 
-__all__ = ["LARGEST_SIGMA", "SMALLEST_SIGMA_PX", "GaussianFits", "Outcome", "fit_gaussians"]
+__all__ = ["LARGEST_SIGMA", "SMALLEST_SIGMA_PX", "GaussianFits", "Outcome", "fit_gaussians", "smallest_sigma"]
 
-SMALLEST_SIGMA_PX = 1.0
-"""Narrower Gaussians fall between the pixels; smaller bounds count as this."""
+SMALLEST_SIGMA_PX = 0.5
+"""Narrower Gaussians fall between the pixels; smaller bounds count as this, or as :func:`smallest_sigma`."""
 
 LARGEST_SIGMA = 10.0
 """In units of the window's longer side; wider Gaussians are flat, so larger bounds count as this."""
@@ -61,9 +62,10 @@ class GaussianFits(NamedTuple):
     def with_noise(self, size: npt.ArrayLike) -> GaussianFits:
         """Return fits whose errors are for noise of size 1 with those for noise of this size, (n,) or one for all."""
         factor = np.sqrt(np.broadcast_to(np.asarray(size, np.float64), self.noise.shape))
-        stderr = self.stderr * factor[:, None]
+        with np.errstate(invalid="ignore"):  # no noise, times an error without end
+            stderr, volume_stderr = self.stderr * factor[:, None], self.volume_stderr * factor
         stderr[:, THETA] = np.minimum(stderr[:, THETA], math.pi / 2)
-        return self._replace(stderr=stderr, volume_stderr=self.volume_stderr * factor)
+        return self._replace(stderr=stderr, volume_stderr=volume_stderr)
 
     @property
     def converged(self) -> npt.NDArray[np.bool_]:
@@ -74,6 +76,20 @@ class GaussianFits(NamedTuple):
     def at_bound(self) -> npt.NDArray[np.bool_]:
         """(n,) whether the fit converged with a parameter that had any freedom on a bound."""
         return np.equal(self.status, Outcome.AT_BOUND)
+
+
+def smallest_sigma(width: int) -> float:
+    """Return the least sigma, px, of a Gaussian in windows so wide: smaller bounds count as this.
+
+    Gaussians of 1 px and more fit into every window. The kernel's recurrences begin at the middle of a row, from which
+    float32 holds a Gaussian up to 13 sigmas away: narrower ones fit where half of the row is no longer than that.
+
+    Examples
+    --------
+    >>> [round(smallest_sigma(width), 2) for width in (7, 13, 21, 51)]
+    [0.5, 0.5, 0.77, 1.0]
+    """
+    return min(1.0, max(SMALLEST_SIGMA_PX, width // 2 / REACH))
 
 
 def fit_gaussians(
@@ -145,10 +161,9 @@ def fit_gaussians(
     n, height, width = windows.shape
     starts, lowers, uppers = (_rows(values, n) for values in (start, lower, upper))
     kernel = gaussian_kernel(blur_sigma_px).astype(np.float64)
-    distances = np.arange(kernel.size) - kernel.size // 2
-    noise = Noise(float(kernel @ distances**2), float(kernel @ kernel) ** 2, bool(counting))
+    noise = Noise(blur_variance(blur_sigma_px), float(kernel @ kernel) ** 2, bool(counting))
     largest = LARGEST_SIGMA * max(height, width)
-    problem = Problem(starts, lowers, uppers, SMALLEST_SIGMA_PX, largest, bool(fixed_shape))
+    problem = Problem(starts, lowers, uppers, smallest_sigma(width), largest, bool(fixed_shape))
     options = Options(estimator == "poisson", float(tolerance_px), int(max_iterations), float(radius_px))
     empty, results = fit_windows(windows, problem, options, noise)
     if empty >= 0:

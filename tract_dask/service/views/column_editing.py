@@ -80,7 +80,7 @@ class Scene:
     sum: Path
     found: Path
     columns: ColumnSettings
-    blur_sigma_px: float
+    blur_sigma_px: float | None
     window_px: int | None
 
     @property
@@ -422,6 +422,8 @@ def _summed(store: Path, stamp: int) -> xr.Dataset:
 
 
 @lru_cache(maxsize=4)
-def _found_again(store: Path, stamp: int, settings: str, blur_sigma_px: float, window_px: int | None) -> xr.Dataset:
+def _found_again(
+    store: Path, stamp: int, settings: str, blur_sigma_px: float | None, window_px: int | None
+) -> xr.Dataset:
     how = from_toml(ColumnSettings, settings)
     return find_columns(_summed(store, stamp), how, blur_sigma_px=blur_sigma_px, window_px=window_px)

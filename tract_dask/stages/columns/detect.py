@@ -73,7 +73,7 @@ class Detector:
     sign
         1 for bright columns, -1 for dark ones.
     blur_sigma_px
-        Least blur before maxima are looked for.
+        Least blur before maxima are looked for; None: what suits the spacing.
     template
         (y, x) picture of a column, bright, on bins as :meth:`step` says; for method ``template``.
     """
@@ -83,7 +83,7 @@ class Detector:
     threshold: float
     min_amplitude: float = 0.0
     sign: int = 1
-    blur_sigma_px: float = 2.0
+    blur_sigma_px: float | None = None
     template: Reals | None = None
 
     @property
@@ -130,7 +130,9 @@ class Detector:
         return Relief(height.astype(np.float32), binned(valid, self.step) == 1, 1.0, self.step)
 
 
-def make_detector(image: Reals, valid: Mask, settings: ColumnSettings, *, blur_sigma_px: float = 2.0) -> Detector:
+def make_detector(
+    image: Reals, valid: Mask, settings: ColumnSettings, *, blur_sigma_px: float | None = None
+) -> Detector:
     """Return the detector of the settings; what they leave open, the spacing and the template, is taken from an image.
 
     Raises
@@ -165,7 +167,7 @@ def make_detector(image: Reals, valid: Mask, settings: ColumnSettings, *, blur_s
     return replace(maxima, method=settings.method, template=template)
 
 
-def _clearer(image: Reals, valid: Mask, settings: ColumnSettings, blur_sigma_px: float) -> str:
+def _clearer(image: Reals, valid: Mask, settings: ColumnSettings, blur_sigma_px: float | None) -> str:
     """Return the contrast of which more stands out: by the squares of the maxima's strengths, without outlying ones."""
     powers = dict.fromkeys(SIGNS, 0.0)
     for contrast in SIGNS if valid.any() else ():
@@ -211,7 +213,7 @@ def detect_columns(
     *,
     settings: ColumnSettings | None = None,
     drift: xr.Dataset | None = None,
-    blur_sigma_px: float = 2.0,
+    blur_sigma_px: float | None = None,
     client: Client | None = None,
     on_event: Sink = silent,
     journal: Path | None = None,
@@ -230,7 +232,7 @@ def detect_columns(
     drift
         Of the movie: places are then drift-corrected, in px of the summed image.
     blur_sigma_px
-        Least blur before maxima are looked for, px.
+        Least blur before maxima are looked for, px; None: what suits the spacing.
     client, on_event, journal
         As for :func:`tract_dask.sum_image`; a movie is worked through shard by shard.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,10 +38,14 @@ from .lattice import (
 )
 from .sites import lattice_sites
 from .twins import twins_of
-from .window_size import neighbour_distance, resolve_window
+from .window_size import default_blur, neighbour_distance, resolve_window, usual_sigma
 
 _SAME = 1 / 3
 """Seeds nearer than this share of the spacing, after refinement, are one column."""
+_USUAL_SIGMA = 0.13
+"""Sigma of a column, in spacings, before it is fitted."""
+_NARROWEST = 0.06
+"""Least sigma that is fitted, in windows, from half a pixel to a pixel: what is narrower is a single pixel's noise."""
 _SIGNIFICANT = 3.0
 """Amplitude, in standard deviations of the blurred image's noise, below which a column is flagged below_noise."""
 _SHAPE_FACTOR = 1.5
@@ -66,7 +71,7 @@ class _Scene:
     known: NDArray[np.bool_]
     sign: int
     noise: float
-    blur_sigma_px: float
+    blur_sigma_px: float | None
     unit: float
     lattices: dict[float | None, Lattice | None] = field(default_factory=dict)
 
@@ -103,6 +108,7 @@ class _Found:
     seeds: _Seeds
     spacing: float
     window_px: int
+    blur_sigma_px: float
     places: Places
     fit: Places
     status: NDArray[np.uint8]
@@ -114,7 +120,7 @@ def find_columns(
     settings: ColumnSettings | None = None,
     *,
     seeds: xr.Dataset | None = None,
-    blur_sigma_px: float = 2.0,
+    blur_sigma_px: float | None = None,
     window_px: int | None = None,
 ) -> xr.Dataset:
     """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
@@ -136,7 +142,8 @@ def find_columns(
         :func:`tract_dask.link_detections` leaves it, the amplitude is divided by the share of the frames in which the
         column is there.
     blur_sigma_px, window_px
-        As in the fit of the frames, px. The window's default is half the columns' spacing, odd.
+        As in the fit of the frames, px. The window's default is half the columns' spacing, odd; the blur's is about
+        0.4 of the columns' sigma (:func:`tract_dask.stages.columns.window_size.default_blur`).
 
     Returns
     -------
@@ -148,10 +155,10 @@ def find_columns(
         distance to the nearest neighbour), window_px, contrast (bright or dark), contrast_rival (the share of its
         support that the other one has, see :mod:`tract_dask.stages.columns.contrast`; None where it was set),
         lattice_px (shortest period of the image; None where it has none, and for columns that were given),
-        blur_sigma_px, pixel_size_pm, n_seeds, and merged: pairs of a column's ID and the number of a later seed that
-        refined to the same column and was dropped. (A seed's number is its ID, or its place in the list of seeds, from
-        1: automatic ones are listed strongest first, those of lattices lattice by lattice, without the sites beyond the
-        image.)
+        blur_sigma_px, sigma_px (the columns' median sigma without that blur), pixel_size_pm, n_seeds, and merged: pairs
+        of a column's ID and the number of a later seed that refined to the same column and was dropped. (A seed's
+        number is its ID, or its place in the list of seeds, from 1: automatic ones are listed strongest first, those of
+        lattices lattice by lattice, without the sites beyond the image.)
 
     Raises
     ------
@@ -183,7 +190,8 @@ def find_columns(
         "contrast": best.contrast,
         "contrast_rival": rival,
         "lattice_px": lattice.spacing if lattice else None,
-        "blur_sigma_px": float(blur_sigma_px),
+        "blur_sigma_px": best.blur_sigma_px,
+        "sigma_px": usual_sigma(best.fit[best.status == 0], best.blur_sigma_px),
         "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
         "n_seeds": len(found.number),
         "merged": sorted([name[first], int(found.number[twin])] for twin, first in twins.items()),
@@ -222,14 +230,19 @@ def _found(scene: _Scene, settings: ColumnSettings, given: xr.Dataset | None, wi
     places = _refined(scene.relief(spacing, min(search / 6, centroid / 3)), seeds.places, search, centroid)
     inside, corner = _corners(places, window_px, scene.valid)
     places = np.where(inside[:, None], places, seeds.places)
-    fit, status, explained = _fit(scene, places, corner, inside, seeds.kind, window_px, max(search, 1.0))
+    blur = default_blur(_USUAL_SIGMA * spacing) if scene.blur_sigma_px is None else float(scene.blur_sigma_px)
+    fitted = partial(_fit, scene, places, corner, inside, seeds.kind, window_px, max(search, 1.0))
+    fit, status, explained = fitted(blur)
+    sigma = usual_sigma(fit[status == 0], blur)
+    if scene.blur_sigma_px is None and sigma and (suiting := default_blur(sigma)) != blur:
+        fit, status, explained = fitted(blur := suiting)
     held = status == 0
     known = next(iter(scene.lattices.values()), None)
     held_by = support(scene.counts, places[held], fit[held], explained[held], spacing=spacing, lattice=known)
-    return _Found(settings.contrast, seeds, spacing, window_px, places, fit, status, held_by)
+    return _Found(settings.contrast, seeds, spacing, window_px, blur, places, fit, status, held_by)
 
 
-def _scene(summed: xr.Dataset, blur_sigma_px: float) -> _Scene:
+def _scene(summed: xr.Dataset, blur_sigma_px: float | None) -> _Scene:
     counts = summed["image"].to_numpy().astype(np.float64, copy=False)
     valid = np.isfinite(counts) & (summed["exposure"].to_numpy() > 0)
     if not valid.any():
@@ -353,6 +366,7 @@ def _fit(
     kind: NDArray[np.str_],
     window_px: int,
     search: float,
+    blur_sigma_px: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
     """Return (n, 7) fits, NaN where the window leaves the image, (n,) flags, and R squared.
 
@@ -365,10 +379,10 @@ def _fit(
     if not inside.any():
         return fit, status, explained
     x, y = corner[inside].T
-    windows = cut_windows(scene.counts[None], y[None], x[None], window_px, scene.blur_sigma_px)[0]
+    windows = cut_windows(scene.counts[None], y[None], x[None], window_px, blur_sigma_px)[0]
     start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
-    options: dict[str, Any] = {"blur_sigma_px": scene.blur_sigma_px, "max_iterations": 200, "radius_px": window_px / 2}
-    filling = windows, np.where(scene.known, scene.counts, np.nan), corner[inside], scene.blur_sigma_px
+    options: dict[str, Any] = {"blur_sigma_px": blur_sigma_px, "max_iterations": 200, "radius_px": window_px / 2}
+    filling = windows, np.where(scene.known, scene.counts, np.nan), corner[inside], blur_sigma_px
     moving = fill_holes(
         *filling, lambda some, n: fit_gaussians(some, start[n], lower[n], upper[n], **options).estimates
     )
@@ -380,7 +394,7 @@ def _fit(
             getattr(fits, name)[odd] = getattr(again, name)
     fit[inside], explained[inside] = fits.estimates, fits.r_squared
     fit[inside, X : Y + 1] += corner[inside]
-    weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.noise * damping(scene.blur_sigma_px))
+    weak = ~(np.abs(fits.estimates[:, AMPLITUDE]) > _SIGNIFICANT * scene.noise * damping(blur_sigma_px))
     restless = ~fits.converged | np.isin(np.arange(len(weak)), moving)
     flags = {Status.BELOW_NOISE: weak, Status.NOT_CONVERGED: restless, Status.AT_BOUND: fits.at_bound}
     for flag, found in flags.items():
@@ -419,7 +433,7 @@ def _bounds(windows: NDArray[np.float32], at: Places, sign: int, search: float) 
     start[:, SIGMA_A], start[:, SIGMA_B] = size / 5, size / 5
     lower[:, AMPLITUDE], upper[:, AMPLITUDE] = np.sort([0 * span, sign * 5 * span], axis=0)
     lower[:, [X, Y]], upper[:, [X, Y]] = at - search, at + search
-    lower[:, [SIGMA_A, SIGMA_B]], upper[:, [SIGMA_A, SIGMA_B]] = 0.5, size
+    lower[:, [SIGMA_A, SIGMA_B]], upper[:, [SIGMA_A, SIGMA_B]] = np.clip(_NARROWEST * size, 0.5, 1.0), size
     lower[:, THETA], upper[:, THETA] = -np.inf, np.inf
     lower[:, BACKGROUND], upper[:, BACKGROUND] = low - 5 * span, high + 5 * span
     return start, lower, upper

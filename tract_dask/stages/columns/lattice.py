@@ -23,6 +23,8 @@ Mask = NDArray[np.bool_]
 TOLERANCE = 0.2
 """How far from its lattice site a column may be, in spacings."""
 
+_WIDEST_BLUR_PX, _BLUR_OF_SPACING, _FINEST_BLUR_PX = 2.0, 0.1, 0.5
+"""Blurs before an image is correlated with itself, where none is set."""
 _SAME_LATTICE = 0.8
 """Correlation, against the highest, from which a shift carries the lattice onto itself."""
 _ORDERED = 0.4
@@ -107,7 +109,7 @@ class Relief:
 
 
 def find_lattice(
-    image: Reals, valid: Mask, noise: float, blur_sigma_px: float, spacing_px: float | None = None
+    image: Reals, valid: Mask, noise: float, blur_sigma_px: float | None, spacing_px: float | None = None
 ) -> Lattice | None:
     """Return the lattice of an image from its autocorrelation, or None where it has none.
 
@@ -124,10 +126,16 @@ def find_lattice(
     noise
         Standard deviation of the noise of a pixel.
     blur_sigma_px
-        Blur before the correlation.
+        Blur before the correlation. None: 2 px; where the lattice is then so fine that this is much of a column, or
+        none is seen, a tenth of its spacing, or half a pixel.
     spacing_px
         Length of ``a``, where it is known: the best within a quarter of it is taken.
     """
+    if blur_sigma_px is None:
+        found = find_lattice(image, valid, noise, _WIDEST_BLUR_PX, spacing_px)
+        finer = _BLUR_OF_SPACING * found.spacing if found else _FINEST_BLUR_PX
+        again = find_lattice(image, valid, noise, finer, spacing_px) if finer < _WIDEST_BLUR_PX else None
+        return again or found
     step = max(1, min(image.shape) // _LARGE)
     blurred = blur(binned(image, step).astype(np.float32), blur_sigma_px / step)
     noise *= damping(blur_sigma_px / step) / step
@@ -299,15 +307,15 @@ def damping(sigma: float) -> float:
 
 
 def relief(
-    image: Reals, valid: Mask, noise: float, spacing: float, blur_sigma_px: float, precision_px: float = np.inf
+    image: Reals, valid: Mask, noise: float, spacing: float, blur_sigma_px: float | None, precision_px: float = np.inf
 ) -> Relief:
     """Return the image in which columns ``spacing`` px apart stand out.
 
     Binned to 24 px a spacing, but to no more than ``precision_px``; blurred to 0.08 of the spacing (a column is about
-    twice as wide); less the surroundings over a third of it.
+    twice as wide), or ``blur_sigma_px`` where that is more; less the surroundings over a third of it.
     """
     step = max(1, int(min(spacing / _PX_PER_SPACING, precision_px)))
-    sigma = max(blur_sigma_px, 0.08 * spacing) / step
+    sigma = max(blur_sigma_px or 0.0, 0.08 * spacing) / step
     fine = blur(binned(image, step).astype(np.float32), sigma)
     height = (fine - smooth(fine, spacing / 3 / step)).astype(np.float32)
     return Relief(height, binned(valid, step) == 1, damping(sigma) * noise / step, step)

@@ -1,13 +1,25 @@
-"""How large the disc is that a column is fitted in."""
+"""How large the disc is that a column is fitted in, and how wide the blur before."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from ...errors import SettingsError
+from ...kernels.gaussian.model import blurred
+from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B
+from ...kernels.windows import blur_variance
 
 SMALLEST_PX = 5
+
+BLUR_SHARE = 0.4
+"""Of the columns' sigma: what the blur before a fit is where it is not set. Fits hardly feel it from 0.2 to 0.6."""
+
+BLURS_PX = (0.5, 1.0, 2.0)
+"""The blurs that are taken, or none. The largest is the paper's."""
 
 
 def neighbour_distance(places: NDArray[np.float64]) -> float | None:
@@ -37,6 +49,39 @@ def default_window(spacing_px: float) -> int:
     43
     """
     return max(7, 2 * round(0.25 * spacing_px) + 1)
+
+
+def default_blur(sigma_px: float) -> float:
+    """Return sigma of the blur, px, for columns of this sigma: of :data:`BLURS_PX` the nearest to 0.4 of it, or none.
+
+    Examples
+    --------
+    >>> [default_blur(sigma) for sigma in (0.8, 1.2, 2.5, 5.0, 20.0)]
+    [0.0, 0.5, 1.0, 2.0, 2.0]
+    """
+    suiting = BLUR_SHARE * sigma_px
+    nearest = min(BLURS_PX, key=lambda blur: abs(math.log(blur / suiting)))
+    return nearest if suiting > nearest / math.sqrt(2) else 0.0
+
+
+def usual_sigma(fit: NDArray[np.float64], blur_sigma_px: float) -> float | None:
+    """Return the median sigma of fits (n, 7) without the blur that the pixels had, px; None where there is none."""
+    known = blurred(fit[np.isfinite(fit).all(axis=1)], -blur_variance(blur_sigma_px))
+    return float(np.median(np.sqrt(known[:, SIGMA_A] * known[:, SIGMA_B]))) if len(known) else None
+
+
+def resolve_blur(blur_sigma_px: float | None, columns: xr.Dataset) -> float:
+    """Return sigma of the blur before the fit of these columns, px: what is given, or what suits their sigma.
+
+    Columns know their sigma (attribute ``sigma_px``) from :func:`tract_dask.find_columns`. For others it is that of
+    their fits, less the blur that these have had (``blur_sigma_px``). Columns without fits have the paper's blur.
+    """
+    if blur_sigma_px is not None:
+        return blur_sigma_px
+    sigma = columns.attrs.get("sigma_px")
+    if sigma is None:
+        sigma = usual_sigma(columns["fit_ref"].to_numpy().astype(np.float64), columns.attrs.get("blur_sigma_px", 0.0))
+    return default_blur(sigma) if sigma else BLURS_PX[-1]
 
 
 def resolve_window(window_px: int | None, shape: tuple[int, ...], spacing_px: float | None = None) -> int:

@@ -15,6 +15,7 @@ from ...kernels.windows import blur
 from ...settings.run import FitSettings
 from ...settings.toml import from_dict
 from ...store.movie import Movie
+from ..columns.window_size import BLURS_PX
 
 Frame = NDArray[np.float32]
 
@@ -37,7 +38,7 @@ def filter_frame(frame: np.ndarray[Any, Any], settings: FitSettings, gain: float
     if settings.filter == "tv-l1":
         counts += np.float32(gain) * _spread(frame)
         return total_variation(counts, settings.tv_fidelity, max_iterations=settings.tv_iterations)
-    return blur(counts, settings.blur_sigma_px) if settings.filter == "gaussian" else counts
+    return blur(counts, settings.noise_blur_px) if settings.filter == "gaussian" else counts
 
 
 def above_offset(pixels: np.ndarray[Any, Any], offset: float) -> np.ndarray[Any, Any]:
@@ -64,7 +65,7 @@ def filter_frames(movie: Movie, name: str = "gaussian", **parameters: float) -> 
     name
         ``gaussian`` (ImageJ's: its radius is sigma), ``wiener``, ``tv-l1`` or ``none``.
     parameters
-        Those of the filter, named as in :class:`tract_dask.settings.FitSettings`: ``blur_sigma_px``;
+        Those of the filter, named as in :class:`tract_dask.settings.FitSettings`: ``blur_sigma_px`` (2);
         ``wiener_background``, ``wiener_cutoff``; ``tv_fidelity``, ``tv_iterations``.
 
     Returns
@@ -79,7 +80,7 @@ def filter_frames(movie: Movie, name: str = "gaussian", **parameters: float) -> 
     """
     import dask.array as da  # takes its time, and workers do not need it
 
-    settings = from_dict(FitSettings, {"filter": name, **parameters}, "filter_frames")
+    settings = from_dict(FitSettings, {"filter": name, "blur_sigma_px": BLURS_PX[-1], **parameters}, "filter_frames")
     frames = movie.frames
     pixels = frames.data.rechunk((1, -1, -1))
 

@@ -17,6 +17,7 @@ from ...kernels.gaussian.model import blurred
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.magnitude import unit_of
 from ...kernels.presence import Filters, matched_filters
+from ...kernels.windows import blur_variance
 from ...settings.run import FitSettings
 from ...settings.toml import from_toml
 from ...store import datasets, metadata, results, schema
@@ -26,7 +27,7 @@ from ...store.journal import left_over
 from ...store.movie import Movie
 from ...store.provenance import provenance
 from ...store.strangers import MOVIE_KEY
-from ..columns.window_size import neighbour_distance, resolve_window
+from ..columns.window_size import neighbour_distance, resolve_blur, resolve_window
 from ..pixel_range import check_pixels
 from .noise_size import WindowNoise, window_noise
 from .vacuum import check_box, find_vacuum, why_unusable
@@ -51,6 +52,7 @@ class Job:
     refined_by: int | None
     """Fewest accepted columns that may refine a frame's drift; None leaves the drift as measured."""
     settings: FitSettings
+    """With the blur that follows the columns, where it was not set."""
     offset: float = 0.0
     """Counts that a pixel without electrons has in the movie."""
     dark_variance: float = 0.0
@@ -151,7 +153,9 @@ class Job:
         reference[~known] = np.median(reference[known], axis=0)
         reference[:, X] = np.where(known, reference[:, X], self.columns["x_ref"].to_numpy())
         reference[:, Y] = np.where(known, reference[:, Y], self.columns["y_ref"].to_numpy())
-        reference = blurred(reference, self.settings.window_blur_px**2 - self.reference_blur_px**2)
+        reference = blurred(
+            reference, blur_variance(self.settings.window_blur_px) - blur_variance(self.reference_blur_px)
+        )
         reference[:, BACKGROUND] += self.dark_variance
         reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
         return reference
@@ -203,10 +207,12 @@ def prepare(
     given = settings.window_px or columns.attrs.get("window_px")
     spacing = None if given else neighbour_distance(positions(columns))
     window_px = resolve_window(given, movie.shape[1:], spacing)
+    blur = resolve_blur(settings.blur_sigma_px, columns)
+    settings = replace(settings, blur_sigma_px=blur)
     box = settings.vacuum_box
     check_box(box, movie.shape[1:], shift)
     if box is None and summed is not None:
-        box = find_vacuum(summed, columns, settings.blur_sigma_px)
+        box = find_vacuum(summed, columns, blur)
     statistics = movie.statistics()
     bad = schema.bad_frames(statistics, math.prod(movie.shape[1:]))
     unusable = why_unusable(movie, box, shift, ~bad) if box else None
@@ -222,7 +228,7 @@ def prepare(
         window_px=window_px,
         vacuum=None if unusable else box,
         unusable=unusable,
-        reference_blur_px=columns.attrs.get("blur_sigma_px", settings.blur_sigma_px),
+        reference_blur_px=columns.attrs.get("blur_sigma_px", blur),
         refined_by=settings.refine_columns if settings.refine_drift and measured else None,
         settings=settings,
         lost=_lost(drift),

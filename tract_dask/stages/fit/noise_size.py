@@ -21,7 +21,7 @@ from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.information import model_slopes
 from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
-from ...kernels.windows import gaussian_kernel
+from ...kernels.windows import blur_variance, gaussian_kernel
 from ...settings.run import FitSettings
 from .goodness import Freedom, freedom
 
@@ -195,7 +195,7 @@ def _exact(column: Floats, size: int, settings: FitSettings) -> tuple[Floats, fl
     inverse = np.linalg.inv(images[:, disc] @ images[:, disc].T)
     reach = kernel.size // 2
     along = np.arange(-reach, size + reach)
-    raw = evaluate(blurred(column, -(settings.window_blur_px**2)), along, along[:, None])
+    raw = evaluate(blurred(column, -blur_variance(settings.window_blur_px)), along, along[:, None])
     variance = np.maximum(raw, 0) if settings.counting and (raw > 0).any() else np.ones_like(raw)
     wide = spread @ images @ spread.T
     meat = np.einsum("iyx,jyx,yx->ij", wide, wide, variance)
