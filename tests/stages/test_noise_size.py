@@ -143,6 +143,15 @@ def test_a_free_shape_on_its_bound_states_no_error_of_its_intensity(tmp_path):
     assert float(np.sqrt((pulls**2).mean())) == pytest.approx(1, abs=PULL)
 
 
+def test_errors_of_intensities_of_free_shapes_are_true_in_the_mean(tmp_path):
+    """Each goes with its own estimate (a faint one states a small error), so their mean square is what holds."""
+    fits, _ = fitted(Row(36, *BRIGHT, {"shape": "free"}), tmp_path)
+    good = (fits["status"].to_numpy() == 0) & np.isfinite(fits["intensity_stderr"].to_numpy())
+    intensity, error = (fits[name].to_numpy()[good] for name in ("intensity", "intensity_stderr"))
+    assert good.mean() > 0.99
+    assert intensity.std() / np.sqrt((error**2).mean()) == pytest.approx(1, abs=PULL)
+
+
 def test_the_size_of_the_noise_is_that_of_most_windows():
     rng = np.random.default_rng(1)
     ratio = 2.5 * rng.chisquare(12, (40, 60)) / 12 * 0.6

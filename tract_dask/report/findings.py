@@ -264,7 +264,7 @@ def _columns(run: Survey) -> Iterator[Finding]:
         text = f"The window of {_of_columns(ids[sometimes])} leaves the image in some frames, as the specimen drifts."
         remedy = "Nothing is wrong. A smaller window (--window-px) reaches closer to the edge."
         yield Finding("at_the_edge", "Columns near the edge are missing at times", text, remedy, serious=False)
-    poor = (columns["residual"].to_numpy() > RESIDUAL) & ~(columns["p_value"].to_numpy() > UNLIKELY)
+    poor = (columns["residual"].to_numpy() > RESIDUAL) & ~(columns["p_value"].to_numpy() > BY_CHANCE / len(ids))
     unlike = _unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy())
     if (poor | unlike).any():
         seen = {
