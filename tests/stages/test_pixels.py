@@ -161,3 +161,18 @@ def test_hot_pixels_cost_no_column_its_reference_where_nothing_drifts(make):
     difference = (found["fit_ref"] - sound["fit_ref"]).to_numpy()
     assert np.nanmax(np.abs(difference[:, 1:3])) < 0.1
     assert np.nanmax(np.abs(difference[:, 0] / sound["fit_ref"].to_numpy()[:, 0])) < 0.05
+
+
+def test_lines_without_data_cost_no_column_where_nothing_drifts(make):
+    """They go from edge to edge through a row and a column of columns."""
+    scene = Scene(n_frames=12, amplitude=60.0, background=20.0, max_drift=0.0)
+    frames = scene.counts()
+    x, y = np.rint(scene.place[0]).astype(int)
+    frames[:, :, x], frames[:, y + 1] = 0, 0
+    found = find_columns(sum_image(make(frames)[0]))
+    sound = find_columns(sum_image(make(scene.counts())[0]))
+    assert found.sizes == sound.sizes
+    assert (found["status_ref"] == 0).all()
+    difference = (found["fit_ref"] - sound["fit_ref"]).to_numpy()
+    assert np.abs(difference[:, 1:3]).max() < 0.15
+    assert np.abs(difference[:, 0] / sound["fit_ref"].to_numpy()[:, 0]).max() < 0.1
