@@ -9,11 +9,12 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, NoReturn
 
 import click
 
-from ..errors import ExitCode, TractError, check_system
+from ..errors import ExitCode, InputError, TractError, check_system
 from . import interrupts
 from .jobs import cancel, jobs, submit, watch
 from .options import Command
@@ -22,6 +23,7 @@ from .run import columns, convert, demo, drift, fit, inspect, run
 from .serve import certs, serve, token
 from .show import DEBUG
 from .simulate import simulate
+from .streams import is_full, nobody_reads
 
 
 class Group(click.Group):
@@ -37,6 +39,7 @@ class Group(click.Group):
         """Run the command; turn what it raises into an exit code."""
         try:
             check_system()
+            _check_folder()
             with _terminated_as_interrupted():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -46,16 +49,34 @@ class Group(click.Group):
             raise
         except TractError as error:
             self._explain(ctx, f"Error: {error}", error.exit_code)
+        except OSError as error:
+            if isinstance(error, BrokenPipeError) and nobody_reads():
+                raise  # click ends the command without a word, as other programs end
+            text = f"Error: what this command prints cannot be written: {error.strerror}. Print it elsewhere."
+            self._explain(ctx, text if is_full(error) else _unexpected(error), ExitCode.FAILED)
         except Exception as error:  # noqa: BLE001  the last resort of the command line, which has to explain itself
-            said = str(error).rstrip(".")
-            text = f"Error: unexpected {type(error).__name__}: {said}. Add --debug to see where; what is done is kept."
-            self._explain(ctx, text, ExitCode.FAILED)
+            self._explain(ctx, _unexpected(error), ExitCode.FAILED)
 
     def _explain(self, ctx: click.Context, text: str, code: int) -> None:
         if ctx.meta.get(DEBUG):
             traceback.print_exc()
-        click.echo(text, err=True)
+        with suppress(OSError):
+            click.echo(text, err=True)
         ctx.exit(code)
+
+
+def _unexpected(error: Exception) -> str:
+    said = str(error).rstrip(".")
+    return f"Error: unexpected {type(error).__name__}: {said}. Add --debug to see where; what is done is kept."
+
+
+def _check_folder() -> None:
+    """Refuse to work in a folder that has been removed."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        remedy = "Go to a folder that is there (cd), and try again"
+        raise InputError("the working folder is gone", got=error.strerror or "", remedy=remedy) from error
 
 
 @click.group(name="tract", cls=Group, context_settings={"help_option_names": ["-h", "--help"]})

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from time import monotonic
 from types import TracebackType
+from typing import IO, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -26,6 +28,7 @@ from ..progress import (
     short,
     size,
 )
+from .streams import Lasting
 
 _PLAIN_INTERVAL_S = 10.0
 
@@ -76,7 +79,7 @@ class Terminal:
     """
 
     def __init__(self, console: Console | None = None) -> None:
-        self.console = console or Console(stderr=True, highlight=False)
+        self.console = console or Console(file=cast("IO[str]", Lasting(sys.stderr)), highlight=False)
         self.lines: dict[str, Line] = {}
         self._printed, self._headed = monotonic(), False
         self._noticed: list[Noticed] = []
