@@ -206,3 +206,14 @@ def test_a_hot_pixel_leaves_no_hole_in_the_sum_whose_offset_is_measured(tmp_path
     assert summed["exposure"][90, 100] == 0
     around = summed["image"][88:93, 98:103]
     assert float(around.min()) < float(around[2, 2]) < float(around.max())
+
+
+@pytest.mark.parametrize(("size", "names"), [(0.0, []), (0.05, ["gain_pattern"])])
+def test_a_fixed_pattern_is_told(size, names):
+    """Budget: its size within 10 %, from 40 frames of 8 electrons."""
+    counts, drift, rng = frames_of()
+    camera = measured(counts * rng.normal(1, size, SHAPE).astype(np.float32), drift)
+    assert camera.fixed_pattern == pytest.approx(size, rel=0.1)
+    found = [words["name"] for words in camera_findings(camera, 1.0, 0.0, 12.0) if "name" in words]
+    assert found == names
+    assert Camera.of(camera.to_attribute()) == camera

@@ -12,6 +12,7 @@ from tract_dask.errors import SettingsError, SourceError
 from tract_dask.readers import open_source
 from tract_dask.run.inspect import describe
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, SourceSettings
+from tract_dask.stages.convert.defects import finder_for
 from tract_dask.stages.convert.origin import movie_key
 from tract_dask.store.schema import REJECTED
 
@@ -187,6 +188,25 @@ def test_a_wrong_line_of_a_list_is_named(camera, tmp_path, text, words):
     settings = ConvertSettings(**LAYOUT, defects=str(tmp_path / "defects.csv"))
     with pytest.raises(SourceError, match=words):
         convert(camera.path("movie"), tmp_path / "movie.zarr", settings=settings)
+
+
+@pytest.mark.parametrize(
+    ("named", "words"),
+    [
+        ({"dark": "dark", "gain_reference": "flat"}, "is inverted.*Use --gain-reference-by divide"),
+        ({"dark": "dark", "gain_reference": "other"}, "do not have the pattern"),
+        ({"dark": "dark", "gain_reference": "gain", "defects": "defects", "movie": "even"}, "brighter than the frames"),
+        ({"gain_reference": "gain", "defects": "defects", "movie": "even"}, "do not have the pattern"),
+        ({"gain_reference": "gain"}, "do not have the pattern.*give --dark"),
+    ],
+)
+def test_references_that_make_frames_worse_are_refused(camera, tmp_path, named, words):
+    camera.save("other", (1 / camera.sensitivity[::-1]).astype(np.float32))
+    camera.save("even", camera.even)
+    source = camera.path(named.pop("movie", "movie"))
+    settings = ConvertSettings(**LAYOUT, **{name: camera.path(file) for name, file in named.items()})
+    with pytest.raises(SourceError, match=words):
+        finder_for(open_source(source), tmp_path, settings)
 
 
 def test_an_offset_is_not_subtracted_twice(camera, tmp_path):

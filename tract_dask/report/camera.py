@@ -9,6 +9,8 @@ from ..store.camera import Camera
 
 OFF = 0.1
 """A gain, or an offset as a share of the usual level above it, that is off by more than this is worth a warning."""
+PATTERN = 0.02
+"""A fixed pattern with a larger standard deviation, as a share of the level, is worth a warning."""
 _SURE = 4.0
 """Standard errors by which it must be off as well."""
 _READ_SHARE = 0.5
@@ -16,7 +18,9 @@ _READ_SHARE = 0.5
 
 
 def camera_findings(camera: Camera, gain: float, offset: float, level: float) -> Iterator[dict[str, Any]]:
-    """Yield what there is to say of gain and offset: title, text, remedy and whether it is serious.
+    """Yield what there is to say of gain, offset and pattern: title, text, remedy and whether it is serious.
+
+    What is not named otherwise has the name ``camera``.
 
     Parameters
     ----------
@@ -25,6 +29,16 @@ def camera_findings(camera: Camera, gain: float, offset: float, level: float) ->
     level
         The usual pixel, detector units.
     """
+    if camera.fixed_pattern > PATTERN:
+        text = (
+            f"The pixels differ in sensitivity by {camera.fixed_pattern:.1%} (standard deviation): a pattern stays where "
+            "it is while the columns move over it. Places and intensities of a column scatter by more than the errors say."
+        )
+        remedy = (
+            "Run again with --gain-reference (and --dark) of this camera; with columns narrower than 1.3 px, look "
+            "first whether the mean image shows a pattern."
+        )
+        yield {"name": "gain_pattern", "title": "The detector has a fixed pattern", "text": text, "remedy": remedy}
     if camera.per_electron is None or camera.zero is None:
         text = f"Gain and offset could not be compared with the noise: {camera.reason}."
         yield {"title": "The camera was not measured", "text": text, "serious": False}

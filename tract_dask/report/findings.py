@@ -156,7 +156,7 @@ def _camera(run: Survey) -> Iterator[Finding]:
     image = run.summed["image"].to_numpy()[run.summed["exposure"].to_numpy() > 0]
     level = float(np.median(image)) / said["gain"] + said["offset"] if image.size else 0.0
     for words in camera_findings(Camera.of(run.summed.attrs), said["gain"], said["offset"], level):
-        yield Finding("camera", **words)
+        yield Finding(**({"name": "camera"} | words))
 
 
 def _pixels(run: Survey) -> Iterator[Finding]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.noise import Cells, Lags, Law, correlation, fit_law, gather, lag_sums
+from ..kernels.patterns import Measured, pattern_power
 from ..kernels.windows import blur
 from ..store.camera import Camera
 from ..store.movie import Movie
@@ -22,6 +23,8 @@ FEWEST_FRAMES = 12
 """With fewer, the mean image is too noisy to tell levels and slopes."""
 _FIELD_PX, _RUN, _PIXELS = 256, 16, 8 << 20
 """Fields of this side, runs of so many frames, and so many pixels of all together are looked at."""
+_MIDDLE_PX = 512
+"""A fixed pattern is looked for in the middle of the field, in a square of this side."""
 _SMOOTH_PX = 1.0
 _REACH_PX = 8
 _SMALLEST_PX = 32
@@ -59,7 +62,25 @@ def measure_camera(movie: Movie, mean: Floats, covered: Bools, drift: Floats, us
         (frames,) which frames count.
     """
     found = _measured(movie, mean, covered, drift, used)
-    return replace(found, frames=movie.summed)
+    power = _pattern(movie, used, movie.offset if found.offset is None else found.offset)
+    known = {} if power is None else {"pattern": power.value, "pattern_stderr": power.stderr}
+    return replace(found, frames=movie.summed, **known)
+
+
+def _pattern(movie: Movie, used: Bools, offset: float) -> Measured | None:
+    """Return the power of a fixed pattern of the pixels, from runs of frames in the middle of the field."""
+    n_frames, *sides = movie.shape
+    rows, columns = (slice(max(0, (side - _MIDDLE_PX) // 2), (side + min(side, _MIDDLE_PX)) // 2) for side in sides)
+    runs = max(1, _PIXELS // (_RUN * min(sides[0], _MIDDLE_PX) * min(sides[1], _MIDDLE_PX)))
+    starts = np.unique(np.linspace(0, max(0, n_frames - _RUN), min(runs, -(-n_frames // _RUN))).astype(int))
+    halves = np.zeros((2, rows.stop - rows.start, columns.stop - columns.start))
+    number = 0
+    for start in starts.tolist():
+        frames = movie.read(start, min(start + _RUN, n_frames), rows, columns)[used[start : start + _RUN]]
+        pairs = len(frames) // 2
+        halves += [frames[k : 2 * pairs : 2].sum(axis=0, dtype=np.float64) for k in (0, 1)]
+        number += pairs
+    return pattern_power(*(halves / number - offset)) if number else None
 
 
 def _measured(movie: Movie, mean: Floats, covered: Bools, drift: Floats, used: Bools) -> Camera:

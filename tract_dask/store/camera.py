@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 ATTRIBUTE = "camera"
 """Name of the attribute."""
 
+_SURE = 5.0
+"""Standard errors of a pattern that is sure to be there."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -32,6 +35,8 @@ class Camera:
         Variance of a pixel for a detector unit above ``zero``: ``per_electron``, or less where pixels share electrons.
     correlation
         Of the noise of pixels at lags (y, x), an odd number of each, the middle is 1; None where not measured.
+    pattern, pattern_stderr
+        Variance of a fixed pattern of the pixels as a share of their level squared; None where not measured.
     frames
         Of the camera in a frame of the movie that was measured.
     reason
@@ -46,6 +51,8 @@ class Camera:
     read_noise: float | None = None
     noise_per_count: float | None = None
     correlation: tuple[tuple[float, ...], ...] | None = None
+    pattern: float | None = None
+    pattern_stderr: float | None = None
     frames: int = 1
     reason: str = ""
 
@@ -82,10 +89,18 @@ class Camera:
             "level without noise": self.zero,
             "offset, measured": self.offset,
             "read noise, rms": self.read_noise,
+            "fixed pattern of the pixels": self.fixed_pattern or None,
             "pixels that share noise": None if self.correlation is None else float(self.shared.sum()),
         }
         known: dict[str, Any] = {name: float(f"{value:.4g}") for name, value in found.items() if value is not None}
         return known | ({"camera": self.reason} if self.reason else {})
+
+    @property
+    def fixed_pattern(self) -> float:
+        """Standard deviation of the pixels' fixed pattern as a share of their level; 0 where there is none for sure."""
+        if self.pattern is None or self.pattern_stderr is None or self.pattern < _SURE * self.pattern_stderr:
+            return 0.0
+        return float(self.pattern**0.5)
 
     @property
     def shared(self) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from ...readers.source import FrameSource
 from ...settings.run import ConvertSettings
 from ...store.arrays import DamagedArrayError, load_saved, save_array
 from ...store.pixels import NO_PIXELS, Pixels
-from .references import read_references
+from .references import check_fits, read_references
 
 _SAMPLE_FRAMES = 32
 FEWEST_FRAMES = 6
@@ -91,6 +91,7 @@ def finder_for(source: FrameSource, folder: Path, settings: ConvertSettings) -> 
         _load(folder)
     except DamagedArrayError:
         references = read_references(source, settings)
+        check_fits(source, settings, references)
         for name, values in zip(_REFERENCES, (references.mask, references.dark, references.gain), strict=True):
             save_array(folder / f"{name}.npy", np.empty((0, 0), np.float32) if values is None else values)
         history = _history(source, Finder(None, references)) if settings.find_defects else None
