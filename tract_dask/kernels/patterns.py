@@ -34,7 +34,7 @@ def fine(image: Floats) -> Floats:
     """Return the fourth differences (y - 4, x - 4) of an image (y, x); white noise keeps its standard deviation."""
     n_y, n_x = image.shape[0] - _REACH, image.shape[1] - _REACH
     rows = sum(weight * image[k : k + n_y] for k, weight in enumerate(_WEIGHTS))
-    found: Floats = sum(weight * rows[:, k : k + n_x] for k, weight in enumerate(_WEIGHTS))  # type: ignore[assignment]
+    found: Floats = sum(weight * rows[:, k : k + n_x] for k, weight in enumerate(_WEIGHTS))
     return found
 
 

@@ -31,8 +31,8 @@ def camera_findings(camera: Camera, gain: float, offset: float, level: float) ->
     """
     if camera.fixed_pattern > PATTERN:
         text = (
-            f"The pixels differ in sensitivity by {camera.fixed_pattern:.1%} (standard deviation): a pattern stays where "
-            "it is while the columns move over it. Places and intensities of a column scatter by more than the errors say."
+            f"The pixels differ in sensitivity by {camera.fixed_pattern:.1%} (standard deviation). Columns move over this "
+            "pattern, and their places and intensities scatter by more than the errors say."
         )
         remedy = (
             "Run again with --gain-reference (and --dark) of this camera; with columns narrower than 1.3 px, look "

@@ -63,8 +63,8 @@ def measure_camera(movie: Movie, mean: Floats, covered: Bools, drift: Floats, us
     """
     found = _measured(movie, mean, covered, drift, used)
     power = _pattern(movie, used, movie.offset if found.offset is None else found.offset)
-    known = {} if power is None else {"pattern": power.value, "pattern_stderr": power.stderr}
-    return replace(found, frames=movie.summed, **known)
+    value, error = power or (None, None)
+    return replace(found, frames=movie.summed, pattern=value, pattern_stderr=error)
 
 
 def _pattern(movie: Movie, used: Bools, offset: float) -> Measured | None:

@@ -161,7 +161,7 @@ def check_fits(movie: FrameSource, settings: ConvertSettings, references: Pixels
             f"{found.value:.2f} of it, with an error of {found.stderr:.2f}",
             f"Use --gain-reference-by {other}"
             if inverted
-            else "Leave it out where frames were corrected before; turn it as the frames are, or give --dark, where not",
+            else "Leave it out where frames were corrected before; else turn it as the frames are, or give --dark",
         )
 
 
