@@ -10,7 +10,7 @@ import pytest
 from tract_dask import sum_image
 from tract_dask.errors import InputError
 from tract_dask.kernels.noise import Cells, fit_law
-from tract_dask.report.camera import camera_findings
+from tract_dask.report.camera import camera_findings, pattern_words
 from tract_dask.stages.noise import measure_camera
 from tract_dask.stages.sum import _measured
 from tract_dask.store.camera import NOT_MEASURED, Camera
@@ -208,12 +208,11 @@ def test_a_hot_pixel_leaves_no_hole_in_the_sum_whose_offset_is_measured(tmp_path
     assert float(around.min()) < float(around[2, 2]) < float(around.max())
 
 
-@pytest.mark.parametrize(("size", "names"), [(0.0, []), (0.05, ["gain_pattern"])])
-def test_a_fixed_pattern_is_told(size, names):
+@pytest.mark.parametrize("size", [0.0, 0.05])
+def test_a_fixed_pattern_is_told(size):
     """Budget: its size within 10 %, from 40 frames of 8 electrons."""
     counts, drift, rng = frames_of()
     camera = measured(counts * rng.normal(1, size, SHAPE).astype(np.float32), drift)
     assert camera.fixed_pattern == pytest.approx(size, rel=0.1)
-    found = [words["name"] for words in camera_findings(camera, 1.0, 0.0, 12.0) if "name" in words]
-    assert found == names
+    assert (pattern_words(camera) is not None) == (size > 0)
     assert Camera.of(camera.to_attribute()) == camera

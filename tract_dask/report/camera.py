@@ -17,10 +17,23 @@ _READ_SHARE = 0.5
 """An offset that would leave more than this share of the noise to the read noise is doubted."""
 
 
-def camera_findings(camera: Camera, gain: float, offset: float, level: float) -> Iterator[dict[str, Any]]:
-    """Yield what there is to say of gain, offset and pattern: title, text, remedy and whether it is serious.
+def pattern_words(camera: Camera) -> dict[str, Any] | None:
+    """Return what there is to say of a fixed pattern: title, text and remedy; None where there is none to speak of."""
+    if camera.fixed_pattern <= PATTERN:
+        return None
+    text = (
+        f"The pixels differ in sensitivity by {camera.fixed_pattern:.1%} (standard deviation). Columns move over this "
+        "pattern, and their places and intensities scatter by more than the errors say."
+    )
+    remedy = (
+        "Run again with --gain-reference (and --dark) of this camera; with columns narrower than 1.3 px, look first "
+        "whether the mean image shows a pattern."
+    )
+    return {"title": "The detector has a fixed pattern", "text": text, "remedy": remedy}
 
-    What is not named otherwise has the name ``camera``.
+
+def camera_findings(camera: Camera, gain: float, offset: float, level: float) -> Iterator[dict[str, Any]]:
+    """Yield what there is to say of gain and offset: title, text, remedy and whether it is serious.
 
     Parameters
     ----------
@@ -29,16 +42,6 @@ def camera_findings(camera: Camera, gain: float, offset: float, level: float) ->
     level
         The usual pixel, detector units.
     """
-    if camera.fixed_pattern > PATTERN:
-        text = (
-            f"The pixels differ in sensitivity by {camera.fixed_pattern:.1%} (standard deviation). Columns move over this "
-            "pattern, and their places and intensities scatter by more than the errors say."
-        )
-        remedy = (
-            "Run again with --gain-reference (and --dark) of this camera; with columns narrower than 1.3 px, look "
-            "first whether the mean image shows a pattern."
-        )
-        yield {"name": "gain_pattern", "title": "The detector has a fixed pattern", "text": text, "remedy": remedy}
     if camera.per_electron is None or camera.zero is None:
         text = f"Gain and offset could not be compared with the noise: {camera.reason}."
         yield {"title": "The camera was not measured", "text": text, "serious": False}

@@ -15,7 +15,7 @@ from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
-from .camera import camera_findings
+from .camera import camera_findings, pattern_words
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -155,8 +155,11 @@ def _camera(run: Survey) -> Iterator[Finding]:
     said = {"gain": 1.0, "offset": 0.0} | run.about["movie"]
     image = run.summed["image"].to_numpy()[run.summed["exposure"].to_numpy() > 0]
     level = float(np.median(image)) / said["gain"] + said["offset"] if image.size else 0.0
-    for words in camera_findings(Camera.of(run.summed.attrs), said["gain"], said["offset"], level):
-        yield Finding(**({"name": "camera"} | words))
+    camera = Camera.of(run.summed.attrs)
+    if words := pattern_words(camera):
+        yield Finding("gain_pattern", **words)
+    for words in camera_findings(camera, said["gain"], said["offset"], level):
+        yield Finding("camera", **words)
 
 
 def _pixels(run: Survey) -> Iterator[Finding]:
