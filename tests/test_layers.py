@@ -91,6 +91,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "hops": [],
         "peaks": [],
         "noise": [],
+        "patterns": [],
         "rendering": [],
         "total_variation": [],
     },
