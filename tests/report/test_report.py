@@ -802,7 +802,8 @@ def test_p_values_of_the_sum_tell_noise_from_a_second_column():
     expected += evaluate(np.array([1.5, *(places[40] + [7.0, 0.0]), 3.5, 3.5, 0.0, 0.0]), x, y)
     exposure = np.full(y.shape, 10, np.uint32)
     summed = xr.Dataset({"image": (("y", "x"), rng.poisson(10 * expected) / 10), "exposure": (("y", "x"), exposure)})
-    tracks = find_columns(summed, ColumnSettings(contrast="bright"), seeds=column_dataset(places), window_px=15)
+    settings, seeds = ColumnSettings(contrast="bright"), column_dataset(places)
+    tracks = find_columns(summed, settings, seeds=seeds, window_px=15, blur_sigma_px=2.0)
     found = residuals(tracks.assign_attrs(reference_blur_px=2.0), summed).p_value
     assert found[40] < 1e-4
     assert 0.001 < (np.delete(found, 40) < 0.01).mean() < 0.03
