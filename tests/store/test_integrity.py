@@ -394,6 +394,27 @@ def test_verify_names_what_is_wrong_and_repairs_the_movie(run, copy):
     assert read(movie) == read(run / "movie.zarr")
 
 
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("movie.zarr/0/c.0.0.0", "movie.zarr/0/c.1.0.0"),
+        ("movie.zarr/binned/4/c.0.0.0", "movie.zarr/binned/4/c.1.0.0"),
+        ("results.zarr/fit/c.0.0.0", "results.zarr/stderr/c.0.0.0"),
+    ],
+)
+def test_shards_that_change_places_are_named(copy, first, second):
+    """Each is sound in itself: every checksum in it is true."""
+    first, second = copy / first, copy / second
+    for one, other in ((first, copy / "aside"), (second, first), (copy / "aside", second)):
+        one.rename(other)
+    found = verify(copy)
+    assert {fault.file for fault in found.faults if fault.what == "damaged"} == {first, second}
+    assert all("belongs to another place" in fault.why for fault in found.faults)
+    if "movie" in str(first):
+        with pytest.raises(StoreError, match="belongs to another place"):
+            read_movie(copy / "movie.zarr")
+
+
 def test_stores_of_two_runs_in_one_folder_are_named(run, copy, tmp_path):
     """Somebody has put the movie of another run, of the same shape, in the place of the first."""
     np.save(tmp_path / "other.npy", Scene(amplitude=50.0).counts())

@@ -23,7 +23,7 @@ from ..store.journal import Journal, entries, journal_beside
 from ..store.locks import sole_use
 from ..store.ome import AXES, CHANGING
 from ..store.parts import SHARDED, Parts, layout
-from ..store.shard_files import ABSENT, read_index, unchecked
+from ..store.shard_files import ABSENT, MARKED, mark_of, read_index, unchecked
 from ..store.strangers import WHY, advice, strangers
 from .beside import Beside, look_beside
 from .faults import STRANGE, Fault
@@ -182,9 +182,10 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
         why = "its pixel size or frame time is being changed, or that was cut off"
         faults.append(Fault(store / METADATA, store, stage, "damaged", why, help="Run the same command again"))
         names = [name for name in names if name not in AXES]
+    key = str(about.get("key")) if about.get(MARKED) else None
     for name in names:
         try:
-            arrays += _Array.of(store, name)
+            arrays += _Array.of(store, name, key)
         except StoreError as error:
             faults.append(_fault(error, store / name / METADATA, store, stage))
     complete = bool(about.get("complete", True)) and metadata.format_of(about) >= metadata.FORMAT
@@ -267,6 +268,8 @@ class _Array:
         What in it has a checksum of its own; None where the file is one.
     checked
         Whether there are checksums.
+    key
+        Of the store; None where its shard files have no marks.
     """
 
     path: Path
@@ -276,9 +279,11 @@ class _Array:
     separator: str
     checked: bool
     in_frames: bool
+    name: str
+    key: str | None
 
     @classmethod
-    def of(cls, store: Path, name: str) -> list[_Array]:
+    def of(cls, store: Path, name: str, key: str | None) -> list[_Array]:
         """Read the metadata of an array, which are checked; none of a group."""
         about = metadata.read_node(store, name)
         if about.get("node_type") != "array":
@@ -295,6 +300,8 @@ class _Array:
             about["chunk_key_encoding"].get("configuration", {}).get("separator", "/"),
             any(codec["name"] == "crc32c" for codec in inner),
             bool(axes) and axes[0] in FRAME_AXES,
+            name,
+            key,
         )
         return [found]
 
@@ -336,7 +343,8 @@ class _Array:
     def _check_tiles(self, handle: int, place: tuple[int, ...]) -> None:
         sides = self.tile or self.chunk
         tiles = [side // part for side, part in zip(self.chunk, sides, strict=True)]
-        index = read_index(handle, tuple(tiles))
+        mark = mark_of(self.key, self.name, place[0]) if self.key else b""
+        index = read_index(handle, tuple(tiles), mark)
         for tile in np.ndindex(*tiles):
             first = [p * side + t * part for p, side, t, part in zip(place, self.chunk, tile, sides, strict=True)]
             if all(at < length for at, length in zip(first, self.shape, strict=True)):

@@ -22,7 +22,7 @@ from .damage import reading
 from .journal import entries, journal_beside
 from .ome import AXES, CHANGING, frame_array
 from .pixels import Pixels, nodes_of, pixels_of, real_of
-from .shard_files import Grid, ShardReader, chunk_path, overlaps
+from .shard_files import MARKED, Grid, ShardReader, chunk_path, mark_of, overlaps
 from .shards import Shard, Shards, split
 
 Frames: TypeAlias = NDArray[Any]
@@ -315,7 +315,14 @@ class Movie:
         path = chunk_path(self.path / name, number, 0, 0, separator=level.separator)
         with (
             reading(path),
-            ShardReader(path, level.grid, level.dtype, encoded=level.encoded, checked=level.checked) as reader,
+            ShardReader(
+                path,
+                level.grid,
+                level.dtype,
+                encoded=level.encoded,
+                checked=level.checked,
+                mark=mark_of(self.key, name, number) if level.marked else b"",
+            ) as reader,
         ):
             yield reader
 
@@ -364,6 +371,7 @@ class _Level:
     dtype: np.dtype[Any]
     encoded: bool
     checked: bool
+    marked: bool
     separator: str
 
 
@@ -374,7 +382,8 @@ def _open_level(path: Path, key: str, name: str) -> _Level:
     named = [codec.to_dict()["name"] for codec in array.compressors]
     grid = Grid(array.shape, array.chunks, array.shards)
     separator = array.metadata.chunk_key_encoding.separator
-    return _Level(grid, array.dtype, "blosc" in named, "crc32c" in named, separator)
+    marked = bool(metadata.attributes(path).get(MARKED))
+    return _Level(grid, array.dtype, "blosc" in named, "crc32c" in named, marked, separator)
 
 
 def _touched(boxes: NDArray[np.int64], shape: tuple[int, ...], tile: tuple[int, int]) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from ..errors import StoreError
 from . import datasets, disk, schema
 from .files import disk_errors
 from .journal import GROWING, Journal, own_file
-from .shard_files import CHECKSUM_BYTES, checksum, decode, encode, unchecked
+from .shard_files import CHECKSUM_BYTES, checksum, decode, encode, mark_of, unchecked
 from .shards import Shard, split
 
 CODEC = "lz4"
@@ -221,8 +221,10 @@ def file_place(name: str) -> list[int]:
     return [0] * (len(schema.RESULTS[name].dims) - 1)
 
 
-def joined(parts: Parts, name: str, shards: range, per_file: int) -> Iterator[bytes]:
+def joined(parts: Parts, key: str, name: str, shards: range, per_file: int) -> Iterator[bytes]:
     """Yield the bytes of the file that holds a variable of some shards; those that are not done are not in it.
+
+    ``key`` is that of the store.
 
     Raises
     ------
@@ -237,7 +239,7 @@ def joined(parts: Parts, name: str, shards: range, per_file: int) -> Iterator[by
             index[k] = offset, len(piece)
             offset += len(piece)
             yield piece
-    yield index.tobytes() + checksum(index)
+    yield mark_of(key, name, shards.start // per_file) + index.tobytes() + checksum(index)
 
 
 def _checked(parts: Parts, shard: int, name: str) -> bytes:

@@ -23,7 +23,7 @@ from . import datasets, disk, files, metadata, schema
 from .journal import Journal, journal_beside
 from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
 from .schema import REJECTED, Status
-from .shard_files import CHUNK_KEYS, chunk_path, codecs
+from .shard_files import CHUNK_KEYS, MARKED, chunk_path, codecs
 from .source_pixels import with_source_coordinates
 
 _SCALES = schema.CALIBRATION[:3]
@@ -91,7 +91,7 @@ def create(
     for name in (*known, *schema.COLUMNS):
         static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
     static.attrs = {name: about.get(name) for name in _SCALES}
-    static.attrs[metadata.ATTRIBUTE] = metadata.json_ready({**about, "complete": False})
+    static.attrs[metadata.ATTRIBUTE] = metadata.json_ready({**about, MARKED: True, "complete": False})
     aside = disk.aside(path)
     step = min(frames_per_shard, len(time))
     per_file = _per_file(-(-len(time) // step), 8 * step * sizes["column_id"] * sizes["parameter"])
@@ -186,13 +186,14 @@ def growing_files(path: Path) -> list[tuple[Path, Iterator[bytes]]]:
     if parts is None:
         return []
     _, _, per_file = layout(path)
+    about = metadata.attributes(path)
     found = []
     for number, start in enumerate(range(0, len(parts.done), per_file)):
         shards = range(start, min(start + per_file, len(parts.done)))
         if parts.done[shards].any():
             for name in SHARDED:
                 file = chunk_path(path / name, number, *file_place(name))
-                found.append((file, joined(parts, name, shards, per_file)))
+                found.append((file, joined(parts, str(about.get("key")), name, shards, per_file)))
     return found
 
 

@@ -2,8 +2,9 @@
 
 A file holds what Zarr v3's ``sharding_indexed`` codec writes: the encoded tiles, each followed by its CRC-32C; then,
 for every tile of the shard in C order, its offset and length (uint64, little-endian), both 2^64 - 1 where a tile is not
-stored; then the CRC-32C of that index. General codec pipelines allocate the buffers of every tile and every shard anew,
-which costs as much as encoding.
+stored; then the CRC-32C of that index. Between tiles and index, where Zarr reads nothing, a *mark* says whose shard it
+is and which: a file that was copied to another's place has true checksums, too. General codec pipelines allocate the
+buffers of every tile and every shard anew, which costs as much as encoding.
 """
 
 from __future__ import annotations
@@ -92,6 +93,15 @@ def crc32c(data: Any, before: int = 0) -> int:
     return int(google_crc32c.extend(before, np.frombuffer(data, np.uint8)))
 
 
+MARKED = "shards_marked"
+"""Attribute of a store whose shard files have marks."""
+
+
+def mark_of(key: str, array: str, number: int) -> bytes:
+    """Return what stands before the index of a shard file: the CRC-32C of a store's key, an array's name, a number."""
+    return checksum(f"{key} {array} {number}".encode())
+
+
 def checksum(data: Any) -> bytes:
     """Return the CRC-32C of contiguous data as Zarr's ``crc32c`` codec writes it behind them."""
     return crc32c(data).to_bytes(CHECKSUM_BYTES, "little")
@@ -160,10 +170,14 @@ class ShardWriter:
         The file's place.
     aside
         A folder on the same disk, for the file while it grows.
+    mark
+        As :func:`mark_of` returns it.
     """
 
-    def __init__(self, path: Path, aside: Path, grid: Grid, dtype: np.dtype[Any], codec: str) -> None:
-        self._path, self._aside, self._codec = path, disk.new_place(aside), codec
+    def __init__(
+        self, path: Path, aside: Path, grid: Grid, dtype: np.dtype[Any], codec: str, *, mark: bytes = b""
+    ) -> None:
+        self._path, self._aside, self._codec, self._mark = path, disk.new_place(aside), codec, mark
         layers, rows, columns = grid.tiles
         depth, height, width = grid.chunk
         self._index = np.full((layers, rows, columns, 2), ABSENT, "<u8")
@@ -199,13 +213,13 @@ class ShardWriter:
             stack.pop_all()
 
     def _finish(self) -> None:
-        """Write the layer that the movie's end leaves unfinished, filled up with zeros, and the index."""
+        """Write the layer that the movie's end leaves unfinished, filled up with zeros, the mark and the index."""
         layer, place = divmod(self._frames, self._layer.shape[2])
         if place:
             self._layer[:, :, place:] = 0
             self._encode(layer)
         index = self._index.tobytes()
-        self._write(index, checksum(index))
+        self._write(self._mark + index, checksum(index))
 
     def _encode(self, layer: int) -> None:
         began = self._offset
@@ -228,20 +242,22 @@ class ShardWriter:
                 parts[0] = parts[0][written:]
 
 
-def read_index(handle: int, tiles: tuple[int, ...]) -> NDArray[np.uint64]:
+def read_index(handle: int, tiles: tuple[int, ...], mark: bytes = b"") -> NDArray[np.uint64]:
     """Return the index at the end of an open shard file: offset and length of each tile, (..., 2).
 
     Raises
     ------
     ValueError
-        Where it is damaged.
+        Where it is damaged, or ``mark`` does not stand before it.
     """
-    index_bytes = 16 * math.prod(tiles) + CHECKSUM_BYTES
-    tail = os.pread(handle, index_bytes, max(0, os.fstat(handle).st_size - index_bytes))
+    tail_bytes = len(mark) + 16 * math.prod(tiles) + CHECKSUM_BYTES
+    tail = os.pread(handle, tail_bytes, max(0, os.fstat(handle).st_size - tail_bytes))
     try:
-        index: NDArray[np.uint64] = np.frombuffer(unchecked(memoryview(tail)), "<u8").reshape(*tiles, 2)
+        index: NDArray[np.uint64] = np.frombuffer(unchecked(memoryview(tail)[len(mark) :]), "<u8").reshape(*tiles, 2)
     except ValueError as error:
         raise ValueError("the index at the end is damaged") from error
+    if tail[: len(mark)] != mark:
+        raise ValueError("this file belongs to another place, or to another store")
     return index
 
 
@@ -254,23 +270,27 @@ class ShardReader:
         Whether tiles went through Blosc.
     checked
         Whether a CRC-32C follows each tile, as it does since format 2.
+    mark
+        What stands before the index, as :func:`mark_of` returns it.
 
     Raises
     ------
     OSError
         Where the file is missing or cannot be read.
     ValueError
-        Where its index or a tile is damaged, or a tile is not stored.
+        Where its index or a tile is damaged, a tile is not stored, or it is another shard.
     """
 
-    def __init__(self, path: Path, grid: Grid, dtype: np.dtype[Any], *, encoded: bool, checked: bool = True) -> None:
-        self._path, self._grid, self._encoded, self._checked = path, grid, encoded, checked
+    def __init__(
+        self, path: Path, grid: Grid, dtype: np.dtype[Any], *, encoded: bool, checked: bool = True, mark: bytes = b""
+    ) -> None:
+        self._path, self._grid, self._encoded, self._checked, self._mark = path, grid, encoded, checked, mark
         self._scratch = np.empty(grid.chunk, dtype)
 
     def __enter__(self) -> ShardReader:
         self._file = self._path.open("rb", buffering=0)
         try:
-            self._index = read_index(self._file.fileno(), self._grid.tiles)
+            self._index = read_index(self._file.fileno(), self._grid.tiles, self._mark)
         except (OSError, ValueError):
             self._file.close()
             raise

@@ -17,7 +17,7 @@ from ...store.layout import LEVEL_DTYPE, Layout
 from ...store.metadata import attributes, update_attributes
 from ...store.ome import AXES, CHANGING, frame_array, write_metadata
 from ...store.pixels import GROUP, NO_PIXELS, Pixels, nodes_of
-from ...store.shard_files import CHUNK_KEYS, Grid, codecs
+from ...store.shard_files import CHUNK_KEYS, MARKED, Grid, codecs
 
 
 def update_metadata(path: Path, metadata: SourceMetadata, **more: Any) -> None:
@@ -59,6 +59,7 @@ def create(path: Path, layout: Layout, codec: str, about: dict[str, Any], known:
     plan = {
         "kind": "movie",
         "complete": False,
+        MARKED: True,
         "shape": layout.shape,
         "dtype": layout.dtype.name,
         "frames_per_shard": layout.frames_per_shard,

@@ -25,7 +25,7 @@ from ...store import files, schema
 from ...store.journal import Payload
 from ...store.layout import LEVEL_DTYPE, Layout
 from ...store.pixels import Pixels
-from ...store.shard_files import ShardWriter, chunk_path
+from ...store.shard_files import ShardWriter, chunk_path, mark_of
 from ...store.shards import Shard
 from ...store.stamps import Stamps
 from .defects import found_in, in_payload
@@ -40,6 +40,7 @@ class Job:
     source: str | tuple[str, ...]
     source_settings: SourceSettings
     path: Path
+    key: str
     aside: Path
     layout: Layout
     codec: str
@@ -138,7 +139,8 @@ def _read_ahead(source: FrameSource, shard: Shard, depth: int) -> Iterator[NDArr
 
 def _writer(job: Job, factor: int, index: int) -> ShardWriter:
     """Return the writer of a shard of the frames (``factor`` 1) or of a binned level."""
-    array = job.path / ("0" if factor == 1 else f"binned/{factor}")
+    name = "0" if factor == 1 else f"binned/{factor}"
     dtype = job.layout.dtype if factor == 1 else LEVEL_DTYPE
-    place = chunk_path(array, index, 0, 0)
-    return ShardWriter(place, job.aside, job.layout.grid(factor), dtype, job.codec)
+    place = chunk_path(job.path / name, index, 0, 0)
+    mark = mark_of(job.key, name, index)
+    return ShardWriter(place, job.aside, job.layout.grid(factor), dtype, job.codec, mark=mark)

@@ -126,7 +126,18 @@ def convert(
     on_event(announce(done_frames=journal.frames_done(shards)))
     stamps = origin_of(movie).stamps
     finder = _finder(movie, settings, journal.path)
-    job = Job(_place(movie), source_settings, path, journal.path, layout, settings.codec, stamps, movie.permit, finder)
+    job = Job(
+        _place(movie),
+        source_settings,
+        path,
+        journal.key,
+        journal.path,
+        layout,
+        settings.codec,
+        stamps,
+        movie.permit,
+        finder,
+    )
     with hold(Folder.at(path)):
         statistics, pixels = _write_shards(movie, job, shards, journal, workers, on_event)
         finalise(path, statistics, known, pixels)
@@ -261,7 +272,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
         stack.callback(remove, aside)
         aside.mkdir()
         stamps, finder = origin_of(source).stamps, _finder(source, settings, aside)
-        job = Job(_place(source), declared, path, aside, layout, settings.codec, stamps, finder=finder)
+        job = Job(_place(source), declared, path, about["key"], aside, layout, settings.codec, stamps, finder=finder)
         gathered = Gathered(source.shape[0], source.shape[1:])
         for shard in chosen:
             payload = convert_shard(job, shard)

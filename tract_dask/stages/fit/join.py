@@ -87,7 +87,7 @@ def _join_task(job: _Joining, file: Shard) -> Payload:
             place = disk.new_place(job.aside)
             stack.callback(place.unlink, missing_ok=True)
             with place.open("wb") as target:
-                target.writelines(joined(parts, name, shards, job.per_file))
+                target.writelines(joined(parts, job.journal.key, name, shards, job.per_file))
             disk.place(place, chunk_path(job.path / name, file.index, *file_place(name)))
         stack.pop_all()
     return {}
