@@ -124,20 +124,9 @@ def convert(
     workers = client() if callable(client) else client
     journal = _begun(path, movie, known, layout, settings, source_settings, on_event)
     on_event(announce(done_frames=journal.frames_done(shards)))
-    stamps = origin_of(movie).stamps
-    finder = _finder(movie, settings, journal.path)
-    job = Job(
-        _place(movie),
-        source_settings,
-        path,
-        journal.key,
-        journal.path,
-        layout,
-        settings.codec,
-        stamps,
-        movie.permit,
-        finder,
-    )
+    key, aside, codec, stamps = journal.key, journal.path, settings.codec, origin_of(movie).stamps
+    finder = _finder(movie, settings, aside)
+    job = Job(_place(movie), source_settings, path, key, aside, layout, codec, stamps, movie.permit, finder)
     with hold(Folder.at(path)):
         statistics, pixels = _write_shards(movie, job, shards, journal, workers, on_event)
         finalise(path, statistics, known, pixels)
