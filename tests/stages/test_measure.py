@@ -50,7 +50,7 @@ def test_positions_and_shapes_match_the_truth(scene, make_movie):
     away = tracks.fit.sel(parameter=["x", "y"]).to_numpy() - scene.place
     assert away.std() <= 1.3 * position_bound(scene)
     assert np.abs(away.mean(axis=0)).max() <= 4 * position_bound(scene) / np.sqrt(scene.n_frames)
-    widths = np.sqrt(np.array([scene.sigma_a, scene.sigma_b]) ** 2 + 2.0**2)  # the blur adds its variance
+    widths = np.sqrt(np.array([scene.sigma_a, scene.sigma_b]) ** 2 + 1.0**2)  # the blur of 1 px adds its variance
     found = tracks.fit.sel(parameter=["sigma_a", "sigma_b"]).mean(("frame", "column_id")).to_numpy()
     np.testing.assert_allclose(found, widths, rtol=0.02)
     assert (tracks.status == 0).mean() > 0.99
@@ -163,7 +163,7 @@ def test_noise_is_that_of_blurred_vacuum(scene, make_movie):
     tracks = fit_columns(
         make_movie(scene.counts()), scene.columns(), scene.drift_dataset(), summed=scene.summed()
     ).compute()
-    expected = np.sqrt(scene.background) / (2 * np.sqrt(np.pi) * 2.0)
+    expected = np.sqrt(scene.background) / (2 * np.sqrt(np.pi) * 1.0)
     assert tracks.noise.mean().item() == pytest.approx(expected, rel=0.1)
 
 
