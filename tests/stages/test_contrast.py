@@ -55,7 +55,7 @@ def test_the_rim_of_the_specimen_does_not_decide(contrast, vacuum):
     assert found.attrs["contrast"] == contrast
     assert found.attrs["lattice_px"] == pytest.approx(SPACING, rel=0.02)
     assert found.attrs["contrast_rival"] < CLOSE
-    assert judged(found)[0] >= 0.9  # beside a step of ten times its height a column is lost
+    assert judged(found)[0] >= 0.88  # beside a step of ten times its height a column or two of 35 are lost
 
 
 def test_a_wedge_does_not_decide():

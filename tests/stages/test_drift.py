@@ -35,6 +35,7 @@ class MemoryMovie:
     offset: float = 0.0
     summed: int = 1
     pixel_size_pm: float | None = 10.0
+    full_scale: float | None = None
     key: str = "key"
     path: Path = Path("memory")
     tile: tuple[int, int, int] = (16, 256, 256)

@@ -46,8 +46,11 @@ def pattern_power(first: Floats, second: Floats) -> Measured | None:
     Parameters
     ----------
     first, second
-        (y, x) means of as many frames each, above the offset; NaN where there is none.
+        (y, x) means of as many frames each, above the offset; not finite where there is none.
     """
+    if min(first.shape) < _REACH + _BLOCK_PX:
+        return None
+    first, second = (np.where(np.isfinite(half), half, np.nan) for half in (first, second))
     mean, half = (first + second) / 2, (first - second) / 2
     both, noise = fine(mean), fine(half)
     level = mean[_REACH // 2 : both.shape[0] + _REACH // 2, _REACH // 2 : both.shape[1] + _REACH // 2]

@@ -155,10 +155,11 @@ def find_columns(
         distance to the nearest neighbour), window_px, contrast (bright or dark), contrast_rival (the share of its
         support that the other one has, see :mod:`tract_dask.stages.columns.contrast`; None where it was set),
         lattice_px (shortest period of the image; None where it has none, and for columns that were given),
-        blur_sigma_px, sigma_px (the columns' median sigma without that blur), pixel_size_pm, n_seeds, and merged: pairs
-        of a column's ID and the number of a later seed that refined to the same column and was dropped. (A seed's
-        number is its ID, or its place in the list of seeds, from 1: automatic ones are listed strongest first, those of
-        lattices lattice by lattice, without the sites beyond the image.)
+        blur_sigma_px, sigma_px (the columns' median sigma without that blur), rounding_variance_px2 (of the summed
+        image), pixel_size_pm, n_seeds, and merged: pairs of a column's ID and the number of a later seed that refined
+        to the same column and was dropped. (A seed's number is its ID, or its place in the list of seeds, from 1:
+        automatic ones are listed strongest first, those of lattices lattice by lattice, without the sites beyond the
+        image.)
 
     Raises
     ------
@@ -192,6 +193,7 @@ def find_columns(
         "lattice_px": lattice.spacing if lattice else None,
         "blur_sigma_px": best.blur_sigma_px,
         "sigma_px": usual_sigma(best.fit[best.status == 0], best.blur_sigma_px),
+        "rounding_variance_px2": summed.attrs.get("rounding_variance_px2", 0.0),
         "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
         "n_seeds": len(found.number),
         "merged": sorted([name[first], int(found.number[twin])] for twin, first in twins.items()),

@@ -70,6 +70,8 @@ class Job:
     """Frames that could not be registered."""
     unusable: str | None = None
     """Why the noise of the vacuum is not taken, in words."""
+    rounding_variance: float = 0.0
+    """What summing by whole pixels adds to the variance of a column, px^2."""
     full_scale: float | None = None
     """Counts at which pixels are cut off; None where they are not."""
 
@@ -90,6 +92,7 @@ class Job:
             vacuum=self.vacuum,
             vacuum_unusable=self.unusable,
             reference_blur_px=self.reference_blur_px,
+            rounding_variance=self.rounding_variance,
             refine_columns=self.refined_by,
             offset=self.offset,
             dark_variance=self.dark_variance,
@@ -114,6 +117,7 @@ class Job:
             window_px=about["window"],
             vacuum=tuple(about["vacuum"]) if about["vacuum"] else None,
             reference_blur_px=about["reference_blur_px"],
+            rounding_variance=about["rounding_variance"],
             refined_by=about["refine_columns"],
             settings=from_toml(FitSettings, about["settings"], str(path)),
             offset=about["offset"],
@@ -134,7 +138,7 @@ class Job:
 
     @cached_property
     def reference(self) -> Floats:
-        """(columns, 7) fit on the summed image, as it would be after the blur of the windows, in :attr:`unit`.
+        """(columns, 7) fit on the summed image, as it is in a frame after the blur of the windows, in :attr:`unit`.
 
         The background has what every pixel of a window has more, so that it is as large as the noise's variance:
         :attr:`dark_variance`.
@@ -153,9 +157,8 @@ class Job:
         reference[~known] = np.median(reference[known], axis=0)
         reference[:, X] = np.where(known, reference[:, X], self.columns["x_ref"].to_numpy())
         reference[:, Y] = np.where(known, reference[:, Y], self.columns["y_ref"].to_numpy())
-        reference = blurred(
-            reference, blur_variance(self.settings.window_blur_px) - blur_variance(self.reference_blur_px)
-        )
+        more = blur_variance(self.reference_blur_px) + self.rounding_variance
+        reference = blurred(reference, blur_variance(self.settings.window_blur_px) - more)
         reference[:, BACKGROUND] += self.dark_variance
         reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
         return reference
@@ -229,6 +232,7 @@ def prepare(
         vacuum=None if unusable else box,
         unusable=unusable,
         reference_blur_px=columns.attrs.get("blur_sigma_px", blur),
+        rounding_variance=columns.attrs.get("rounding_variance_px2", 0.0),
         refined_by=settings.refine_columns if settings.refine_drift and measured else None,
         settings=settings,
         lost=_lost(drift),
