@@ -218,7 +218,7 @@ def _found(run: Survey) -> Iterator[Finding]:
     if sigma and sigma < NARROW_PX:
         text = (
             f"The columns have a sigma of {sigma:.2g} px: too few pixels for their places, which are drawn to the "
-            "middles of pixels by a hundredth of a pixel and more."
+            "middles of pixels by thousandths of a pixel."
         )
         remedy = "Record with smaller pixels, or convert without --bin."
         yield Finding("undersampled", "Columns are narrower than the pixels can tell", text, remedy)
