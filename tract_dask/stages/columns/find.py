@@ -138,9 +138,8 @@ def find_columns(
         Defaults to automatic columns; with contrast ``auto`` both are tried, and the better one is taken.
     seeds
         Columns to start from, as :func:`lattice_columns` and :func:`read_columns_csv` return them and as you may have
-        changed them; they take the place of the method, and keep their IDs. With a variable ``share``, as
-        :func:`tract_dask.link_detections` leaves it, the amplitude is divided by the share of the frames in which the
-        column is there.
+        changed them; they take the place of the method, and keep their IDs. With ``share``, the share of the frames in
+        which a column is there (:func:`tract_dask.link_detections`), the amplitude is divided by it.
     blur_sigma_px, window_px
         As in the fit of the frames, px. The window's default is half the columns' spacing, odd; the blur's is about
         0.4 of the columns' sigma (:func:`tract_dask.stages.columns.window_size.default_blur`).
@@ -158,8 +157,7 @@ def find_columns(
         blur_sigma_px, sigma_px (the columns' median sigma without that blur), rounding_variance_px2 (of the summed
         image), pixel_size_pm, n_seeds, and merged: pairs of a column's ID and the number of a later seed that refined
         to the same column and was dropped. (A seed's number is its ID, or its place in the list of seeds, from 1:
-        automatic ones are listed strongest first, those of lattices lattice by lattice, without the sites beyond the
-        image.)
+        automatic ones strongest first, those of lattices lattice by lattice, without sites beyond the image.)
 
     Raises
     ------
