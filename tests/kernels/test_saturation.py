@@ -45,3 +45,16 @@ def test_frames_without_noise_have_none():
     still = np.repeat(np.rint(levels(200, 30))[None], 4, axis=0)
     assert found(still) is None
     assert found(np.full((4, *SHAPE), 5.0)) is None
+
+
+def test_a_level_into_which_dark_columns_fade_is_not_full_scale():
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] % 24 - 11.7
+    dark = 1 - 0.5 * np.exp(-(y**2 + x**2) / (2 * 2.5**2))
+    for scale in (1.0, 200.0, 1000.0, 30_000.0):
+        image = np.float32(dark) if scale == 1 else np.rint(scale * dark)
+        assert found(np.repeat(image[None], 4, axis=0)) is None
+
+
+def test_a_flat_image_with_hardly_any_noise_is_cut_off():
+    flat = np.random.default_rng(0).normal(254.5, 0.7, (9, *SHAPE))
+    assert found(np.minimum(np.rint(flat), 255)) == 255

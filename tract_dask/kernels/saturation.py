@@ -2,6 +2,7 @@
 
 Values become rarer towards the largest one, the more the farther: with n pixels of the largest value and m of the next
 one below, about n^2 / m would be higher still. Where that is many, and there are none, something has cut them off.
+Not so where values fade into the largest one, as dark columns without noise do into the vacuum around them.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ _MISSING = 30.0
 _RATIO, _RATIO_OF_BITS = 3.0, 1.0
 """So many times as many pixels have the largest value as the next one; less is enough where it is 2^n - 1."""
 _EXACT = 2.0**24
+_FADES, _LITTLE, _ALONE = 0.5, 1e-3, 0.02
+"""It fades where this share of the pixels beside it have the next value, or this little of the range less, and hardly
+any pixel stands alone, as many do in noise."""
 
 
 def full_scale(usual_high: NDArray[np.float32], frame: NDArray[Any], used: NDArray[np.bool_]) -> float | None:
@@ -40,7 +44,8 @@ def full_scale(usual_high: NDArray[np.float32], frame: NDArray[Any], used: NDArr
     known = usual_high[used & np.isfinite(usual_high)]
     if not known.size or (top := float(known.max())) >= _EXACT or not _cut_off(known, top):
         return None
-    return top if _cut_off(frame[used & np.isfinite(frame)], top) else None
+    good = used & np.isfinite(frame)
+    return top if _cut_off(frame[good], top) and not _fades(frame, good, top) else None
 
 
 def _cut_off(values: NDArray[Any], top: float) -> bool:
@@ -52,3 +57,17 @@ def _cut_off(values: NDArray[Any], top: float) -> bool:
     beside = int(np.count_nonzero(below == below.max()))
     of_bits = top >= 1 and np.log2(top + 1) % 1 == 0
     return reached > (_RATIO_OF_BITS if of_bits else _RATIO) * beside and reached**2 > _MISSING * beside
+
+
+def _fades(frame: NDArray[Any], good: NDArray[np.bool_], top: float) -> bool:
+    """Tell whether the pixels (y, x) beside those equal to ``top`` are hardly lower, and none is alone as in noise."""
+    reached = good & (frame == top)
+    padded = np.pad(reached, 1).astype(np.int8)
+    around = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+    beside = good & ~reached & (around > 0)
+    if not beside.any():
+        return False
+    alone = np.count_nonzero(reached & (around == 0)) + np.count_nonzero(beside & (around == 4))
+    below = frame[good & ~reached]
+    near = min(float(below.max()), top - _LITTLE * (top - float(below.min())))
+    return bool((frame[beside] >= near).mean() > _FADES and alone < _ALONE * beside.sum())

@@ -30,6 +30,12 @@ _REACH_PX = 8
 _SMALLEST_PX = 32
 _STILL = 0.02
 """Pixels in which motion adds no more than this share of the noise tell how pixels share it."""
+_ALIKE_PX = 2.0
+"""Pixels so near have noise alike."""
+_FIXED = 0.005
+"""Pixels in which the shift of the image adds more than this share of the noise do not tell gain and offset."""
+_SHARPEST_PX2 = 0.3
+"""Variance of the sharpest image that is expected; noise in the level looks sharper."""
 _USUAL_MOTION_PX2 = 0.2**2
 _FEWEST_PIXELS = 1 << 14
 _SURE = 0.1
@@ -216,6 +222,8 @@ def _fields(
         frames = np.where(usable, frames, 0).astype(np.float32)
         own_slopes = [slope[here] for slope in slopes]
         differences = _compared(frames, level[here], own_slopes, left[number], usable)
+        usable &= _keeps_still(level[here], own_slopes, left[number], differences)
+        frames, differences = (np.where(usable, values, 0).astype(np.float32) for values in (frames, differences))
         yield _Field(frames, differences, level[here], own_slopes[0] ** 2 + own_slopes[1] ** 2, usable)
 
 
@@ -237,6 +245,30 @@ def _compared(
         if power > 0:
             one -= np.float32((one * about).sum(dtype=np.float64) / power) * about
     return np.where(usable, differences, 0).astype(np.float32)
+
+
+def _keeps_still(
+    level: Image, slopes: list[Image], left: NDArray[np.float32], differences: NDArray[np.float32]
+) -> Bools:
+    """Tell in which pixels (y, x) motion adds hardly anything to the noise that the level's slope does not take off.
+
+    The level is smoother than the image. What smoothing it again takes from its slopes tells how sharp the image is: of
+    Gaussians with a variance v the root mean square is in proportion to 1 / v. Places beyond a slope are on its curve.
+    """
+    again = [blur(slope, _SMOOTH_PX) for slope in slopes]
+    first, second = (
+        float(np.sqrt(sum(np.square(s, dtype=np.float64).mean() for s in every))) for every in (slopes, again)
+    )
+    kept, width = second / first if first else 1.0, _SMOOTH_PX**2
+    sharp = max(width * (2 * kept - 1) / max(1 - kept, 1e-6), _SHARPEST_PX2)
+    y, x = left.astype(np.float64).T
+    bend = [np.gradient(slope) for slope in slopes]
+    curves = ((bend[0][0], y * y / 2), (bend[1][1], x * x / 2), (bend[0][1], y * x))
+    lost = sum(np.square(one - two) * moved.var() for one, two, moved in zip(slopes, again, (y, x), strict=True))
+    curved = sum(np.square(curve) * moved.var() for curve, moved in curves)
+    added = lost * (1 + 2 * width / sharp) ** 2 + curved * (1 + width / sharp) ** 4
+    noise = blur(np.square(differences).mean(axis=0, dtype=np.float64) / 2, _ALIKE_PX)
+    return np.asarray(added < _FIXED * noise)
 
 
 def _places(movie: Movie) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
