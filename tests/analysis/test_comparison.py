@@ -80,7 +80,9 @@ def test_the_warning_names_the_column_and_how_far(compared):
     said = wiener_shifts(compared)
     assert sum(f"column {OFF + 1} in 2 of 2 frames" in sentence for sentence in said) == 1
     assert all("px (" in sentence and "pm)" in sentence for sentence in said)
-    assert len(said) <= 8
+    assert (
+        len(said) <= 10
+    )  # of 64 columns in two frames: against a blur of 1 px the filter moves some of the others, too
 
 
 def test_the_table_holds_differences_from_the_unfiltered_frame(compared, tmp_path):

@@ -111,7 +111,8 @@ def test_intensities_of_counts_scatter_as_the_fits_say(scene, make_movie):
     assert float(errors["mean"].mean()) == pytest.approx(volume, rel=0.02)
     ratio = np.sqrt(float((errors["sd"] ** 2).mean() / (errors["fitted"] ** 2).mean()))
     assert ratio == pytest.approx(1.0, abs=0.12)  # 12 columns, 40 frames: known to 3 %
-    blurred = np.sqrt((scene.sigma_a**2 + 4) * (scene.sigma_b**2 + 4))
+    blur = tracks.attrs["window_blur_px"] ** 2
+    blurred = np.sqrt((scene.sigma_a**2 + blur) * (scene.sigma_b**2 + blur))
     equation_5 = np.sqrt(volume + 8 * np.pi * scene.background * blurred)
     np.testing.assert_allclose(errors["predicted"], equation_5, rtol=0.03)
 

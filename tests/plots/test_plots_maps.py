@@ -101,7 +101,7 @@ def test_ellipses_at_half_maximum_have_the_size_and_direction_of_the_fit(tracks,
     assert away.min() == pytest.approx(half * sigma_b, rel=1e-3)
     along = outline[away.argmax()] / away.max()
     assert abs(along @ [np.cos(0.5), -np.sin(0.5)]) == pytest.approx(1, abs=1e-3)
-    np.testing.assert_allclose(rings.get_array(), 2 * half * PIXEL_PM * np.sqrt(sigma_a * sigma_b))
+    np.testing.assert_allclose(rings.get_array(), 2 * half * PIXEL_PM * np.sqrt(sigma_a * sigma_b), rtol=1e-4)
 
 
 def test_jumps_are_arrows_and_points_in_time(tracks, summed):

@@ -31,9 +31,10 @@ def test_data_files_are_one_movie(tmp_path: Path) -> None:
     found = open_source(master).metadata
     assert (found.frame_time_s, found.pixel_size_pm) == (0.002, None)
     assert found.references["defects"] == Path(f"{master}::/entry/instrument/detector/pixel_mask")
-    untested, masked = found.notes
+    untested, masked, option = found.notes
     assert "was not tested with a file from a camera" in untested
     assert "masks 3 pixels" in masked
+    assert "--defects" in option
     assert open_source(str(found.references["defects"])).read(0, 1).sum() == 3
     part = open_source(f"{master}::/entry/data/data_000002")
     np.testing.assert_array_equal(part.read(0, 2), FRAMES[2:4])

@@ -40,6 +40,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _BY_LAYOUT = {"convert.shard_mb", "convert.tile_px"}
 """Settings that need not be the same for the same store."""
 
+_FOLLOWING = {"fit.blur_sigma_px"}
+"""Settings that follow the columns where a run leaves them open; stores say what they became."""
+
 
 @dataclass(frozen=True)
 class Beside:
@@ -124,7 +127,8 @@ def _others(store: Path, about: dict[str, Any], now: RunSettings) -> list[str]:
         return []
     before = counted(stage, **_groups(now) | {_group(group): group for group in then.values()})
     after = counted(stage, **_groups(now))
-    return sorted(name for name in {*before, *after} - _BY_LAYOUT if before.get(name) != after.get(name))
+    left_out = _BY_LAYOUT | (_FOLLOWING - after.keys())
+    return sorted(name for name in {*before, *after} - left_out if before.get(name) != after.get(name))
 
 
 def _groups(settings: RunSettings) -> dict[str, Settings]:
