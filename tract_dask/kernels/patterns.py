@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 _WEIGHTS = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 _REACH = len(_WEIGHTS) - 1
+_INSIDE = slice(_REACH // 2, -(_REACH // 2))
+"""Pixels of an image that fourth differences are of, along an axis."""
 _SHARED = (2 * np.square(np.correlate(_WEIGHTS, _WEIGHTS, "full")[_REACH:]).sum() - 1) ** 2
 """Neighbours share fourth differences: so many pixels are worth one."""
 _BLOCK_PX = 16
@@ -53,7 +55,7 @@ def pattern_power(first: Floats, second: Floats) -> Measured | None:
     first, second = (np.where(np.isfinite(half), half, np.nan) for half in (first, second))
     mean, half = (first + second) / 2, (first - second) / 2
     both, noise = fine(mean), fine(half)
-    level = mean[_REACH // 2 : both.shape[0] + _REACH // 2, _REACH // 2 : both.shape[1] + _REACH // 2]
+    level = mean[_INSIDE, _INSIDE]
     good = _usual(both) & np.isfinite(noise) & (level > 0)
     powers = _in_blocks(np.where(good, both**2 - noise**2, 0))
     levels = _in_blocks(np.where(good, level**2, 0))
@@ -71,8 +73,7 @@ def likeness(mean: Floats, sensitivity: Floats) -> Measured | None:
     -1 where the mean has its inverse, 0 where it has nothing of it. None where the sensitivity has no pattern.
     """
     seen, known = fine(mean), fine(sensitivity)
-    inside = slice(_REACH // 2, -(_REACH // 2))
-    level = _smooth(mean)[inside, inside]
+    level = _smooth(mean)[_INSIDE, _INSIDE]
     good = _usual(seen) & np.isfinite(known) & np.isfinite(level) & (level > 0)
     pattern, seen, level = known[good], seen[good], level[good]
     weight = float((level * pattern**2).sum())
@@ -102,5 +103,5 @@ def _smooth(image: Floats) -> Floats:
     """Return the mean of 5 x 5 pixels around each, NaN at the edges."""
     found = np.full(image.shape, np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(image, (_REACH + 1, _REACH + 1))
-    found[_REACH // 2 : -(_REACH // 2), _REACH // 2 : -(_REACH // 2)] = windows.mean(axis=(2, 3))
+    found[_INSIDE, _INSIDE] = windows.mean(axis=(2, 3))
     return found

@@ -73,6 +73,13 @@ def shared_noise(
     return SharedNoise(factors[:, :8], factors[:, 8])
 
 
+def noise_spectrum(correlation: Floats, shape: tuple[int, ...]) -> Floats:
+    """Return the power of noise with an autocorrelation (2 r + 1, 2 r + 1), at the frequencies of ``rfft2``."""
+    lags, lag = np.zeros(shape), np.arange(len(correlation)) - len(correlation) // 2
+    lags[np.ix_(lag % shape[0], lag % shape[1])] = correlation
+    return np.asarray(np.fft.rfft2(lags).real)
+
+
 def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how: tuple[bool, bool, bool]) -> Floats:
     fixed_shape, counting, likelihood = how
     margin = kernel.size // 2
@@ -89,7 +96,6 @@ def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how
     if likelihood:
         slopes = slopes / np.sqrt(variance)
     hessian = np.linalg.pinv(slopes @ slopes.T)
-    reach = len(correlation) // 2
     padded = (2 * side, 2 * side)
     images = slopes.reshape(-1, side, side)
     if not likelihood:
@@ -97,13 +103,10 @@ def _factors(column: Floats, size: int, correlation: Floats, kernel: Floats, how
         spread = np.fft.irfft2(np.fft.rfft2(images, padded) * blur, padded)
         images = spread[:, margin : margin + side, margin : margin + side] * np.sqrt(variance).reshape(side, side)
     own = np.fft.rfft2(images, padded)
-    lags = np.zeros(padded)
-    lag = np.arange(-reach, reach + 1)
-    lags[np.ix_(lag % padded[0], lag % padded[1])] = correlation
     traces = _traces(variance[disc], correlation, kernel, likelihood=likelihood)
     errors, remains = [], []
     white = np.ones((padded[0], padded[1] // 2 + 1))
-    for spectrum, trace in zip((white, np.fft.rfft2(lags).real), traces, strict=True):
+    for spectrum, trace in zip((white, noise_spectrum(correlation, padded)), traces, strict=True):
         shared = np.fft.irfft2(own * spectrum, padded)[:, :side, :side].reshape(len(images), -1)
         meat = images.reshape(len(images), -1) @ shared.T
         covariance = hessian @ meat @ hessian

@@ -59,11 +59,9 @@ class Finder:
     @cached_property
     def mask(self) -> NDArray[np.uint8] | None:
         """What is left out of all frames; None: nothing."""
-        found, named = self.history.mask if self.history else None, self.references.mask
-        either = [mask for mask in (found, named) if mask is not None and mask.any()]
-        if found is None or named is None or len(either) < 2:
-            return either[0] if either else None
-        return np.where(named > 0, named, found)
+        both = self.references.mask, self.history.mask if self.history else None
+        masks = [mask for mask in both if mask is not None and mask.any()]
+        return np.where(masks[0] > 0, masks[0], masks[-1]) if masks else None
 
     def saturated(self, frame: NDArray[Any], shown: NDArray[Any]) -> tuple[int, int]:
         """Return how many pixels of a frame (y, x) are at full scale, and how many are higher.

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...kernels.gaussian.correlated import noise_spectrum
 from ...kernels.gaussian.intensity import Floats
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.windows import Tiles, gaussian_kernel
@@ -91,11 +92,7 @@ def _spread(frame: NDArray[np.float32], level: float, correlation: Floats) -> tu
     Electrons are spread over neighbours, which leaves their number; the second value is by what that makes the standard
     deviation of a pixel smaller.
     """
-    reach = len(correlation) // 2
-    lags = np.zeros(frame.shape)
-    lag = np.arange(-reach, reach + 1)
-    lags[np.ix_(lag % frame.shape[0], lag % frame.shape[1])] = correlation
-    power = np.maximum(np.fft.rfft2(lags).real, 0)
+    power = np.maximum(noise_spectrum(correlation, frame.shape), 0)
     share = 1 / np.sqrt(power[0, 0])
     spread = np.fft.irfft2(np.fft.rfft2(frame - level) * np.sqrt(power) * share, frame.shape)
     return (level + spread).astype(np.float32), float(share)

@@ -70,7 +70,7 @@ def window_noise(reference: Floats, size: int, settings: FitSettings, correlatio
     correlation
         (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; None: they share none.
     """
-    noise = _of_white(reference, size, settings)
+    noise = _of_white(reference, size, settings, freedom(_middle(reference), size, settings, correlation))
     if correlation is None:
         return noise
     shared = shared_noise(
@@ -86,7 +86,7 @@ def window_noise(reference: Floats, size: int, settings: FitSettings, correlatio
         noise.errors * shared.errors[:, :7],
         noise.volume * shared.errors[:, 7],
         noise.left * shared.left,
-        freedom(_middle(reference), size, settings, correlation),
+        noise.free,
         noise.level / correlation.sum(),
     )
 
@@ -97,7 +97,7 @@ def _middle(reference: Floats) -> Floats:
     return np.asarray(reference[np.argsort(width, kind="stable")[len(width) // 2]])
 
 
-def _of_white(reference: Floats, size: int, settings: FitSettings) -> WindowNoise:
+def _of_white(reference: Floats, size: int, settings: FitSettings, free: Freedom) -> WindowNoise:
     """Return what windows do with noise of which pixels share none."""
     width = np.sqrt(reference[:, SIGMA_A] * reference[:, SIGMA_B])
     order = np.argsort(width, kind="stable")
@@ -105,7 +105,6 @@ def _of_white(reference: Floats, size: int, settings: FitSettings) -> WindowNois
     some = reference[chosen].copy()
     some[:, [X, Y]] = size // 2
     nearest = np.abs(np.log(width[:, None] / width[chosen])).argmin(axis=1)
-    free = freedom(_middle(reference), size, settings)
     counts = np.array([evaluate(column, *_places(size)).mean() for column in some])[nearest]
     counted = (settings.counting or settings.estimator == "poisson") & (counts > 0)
     level = np.where(counted, counts, np.inf)
