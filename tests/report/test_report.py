@@ -196,6 +196,14 @@ def test_numbers_of_columns_are_those_of_the_dataset(written):
     assert float(found["residual"].max()) < 0.02  # the scene is Gaussians; what their neighbours add, and the blur
 
 
+@pytest.mark.parametrize(("error", "said"), [(400, None), (1000, "about 6%")])
+def test_intensities_that_noise_makes_larger_are_told(run, error, said):
+    run.values["intensity_stderr"][:] = error
+    found = {finding.name: finding for finding in findings(survey(run.write(), []))}
+    assert ("faint" in found) == (said is not None)
+    assert said is None or said in found["faint"].text
+
+
 def test_good_run_has_no_warnings(run):
     assert run.names() == set()
 

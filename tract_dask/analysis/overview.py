@@ -26,7 +26,7 @@ COUNTS = ("fits", "accepted", "outside", *_FLAGS, "unlike")
 UNLIKELY = 1e-3
 """A fit is unlike one Gaussian where its p-value is below this."""
 
-MEANS = ("x", "y", "intensity", "r_squared", "variance")
+MEANS = ("x", "y", "intensity", "r_squared", "variance", "intensity_variance")
 _READ = ("fit", "stderr", "intensity", "intensity_stderr", "r_squared", "status", "drift", "p_value")
 
 
@@ -70,7 +70,7 @@ class ColumnSums:
         made fits with each flag, and accepted ones that are unlike one Gaussian.
     moments
         (3, :data:`MEANS`, column): how many accepted fits have a value, its mean, and the sum of squares about the
-        mean. x and y in px; ``variance`` is the stated one of the place, per axis.
+        mean. x and y in px; ``variance`` is the stated one of the place, per axis; ``intensity_variance`` alike.
     """
 
     counts: NDArray[np.int64]
@@ -100,7 +100,8 @@ class ColumnSums:
         dict
             By name (column): :data:`COUNTS`; ``share`` of the made fits that were accepted; over accepted fits the mean
             ``r_squared`` and ``intensity``, the standard deviations ``sd_x`` and ``sd_y``, ``spread``, their root mean
-            square, ``expected``, that of the stated errors, and ``excess``, the one over the other. NaN: not known.
+            square, ``expected``, that of the stated errors, and ``excess``, the one over the other; ``faint``, the mean
+            square of the intensity's stated error over the mean intensity squared. NaN: not known.
         """
         counts = dict(zip(COUNTS, self.counts, strict=True))
         known, mean, squares = self.moments
@@ -116,6 +117,7 @@ class ColumnSums:
             "spread": spread,
             "expected": expected,
             "excess": spread / np.where(expected > 0, expected, np.nan),
+            "faint": means["intensity_variance"] / np.where(means["intensity"] != 0, means["intensity"] ** 2, np.nan),
         }
 
 
@@ -154,7 +156,7 @@ class Part:
         counts = [self._fitted, self._accepted, self._has(Status.OUTSIDE_FRAME), *flagged, self._unlike]
         variance = (self.series[3] ** 2 + self.series[4] ** 2) / 2
         r_squared = np.where(self._accepted, self._r_squared, np.nan)
-        values = np.stack([*self.series[:3], r_squared, variance])
+        values = np.stack([*self.series[:3], r_squared, variance, self.series[5] ** 2])
         known = np.isfinite(values)
         n = known.sum(axis=1)
         mean = np.where(known, values, 0).sum(axis=1) / np.maximum(n, 1)

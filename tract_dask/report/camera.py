@@ -1,9 +1,12 @@
-"""What a report says of the camera: what was measured, and where that is not what was said."""
+"""What a report says of the camera: what was measured, and where that is not what was said; and of faint columns."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..store.camera import Camera
 
@@ -11,6 +14,8 @@ OFF = 0.1
 """A gain, or an offset as a share of the usual level above it, that is off by more than this is worth a warning."""
 PATTERN = 0.02
 """A fixed pattern with a larger standard deviation, as a share of the level, is worth a warning."""
+FAINT = 0.03
+"""Square of the relative error of a single frame's intensity from which a warning is worth it."""
 _SURE = 4.0
 """Standard errors by which it must be off as well."""
 _READ_SHARE = 0.5
@@ -30,6 +35,25 @@ def pattern_words(camera: Camera) -> dict[str, Any] | None:
         "whether the mean image shows a pattern."
     )
     return {"title": "The detector has a fixed pattern", "text": text, "remedy": remedy}
+
+
+def faint_words(faint: NDArray[np.float64]) -> dict[str, Any] | None:
+    """Return what there is to say of intensities that noise makes too large; None where that is little.
+
+    A fit looks for its place, and finds that at which noise adds to the column: in units of its error s the amplitude A
+    is higher by s / A in the mean, so by the share (s / A)^2, of which ``faint`` (column) is the estimate.
+    """
+    known = faint[np.isfinite(faint)]
+    share = float(np.median(known)) if known.size else 0.0
+    if share <= FAINT:
+        return None
+    text = (
+        f"The intensity of a column in a single frame has an error of {np.sqrt(share):.0%} (median). Fits end where "
+        f"noise adds to a column: intensities and amplitudes are too large by about {share:.0%} in the mean, and the "
+        "errors of places are too small by about as much."
+    )
+    remedy = "Sum frames (rebin_frames). Columns that are equally bright can be compared with each other as well."
+    return {"title": "Columns are faint in single frames", "text": text, "remedy": remedy}
 
 
 def camera_findings(camera: Camera, gain: float, offset: float, level: float) -> Iterator[dict[str, Any]]:

@@ -15,7 +15,7 @@ from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
-from .camera import camera_findings, pattern_words
+from .camera import camera_findings, faint_words, pattern_words
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -372,6 +372,8 @@ def _why_no_errors(run: Survey) -> tuple[str, str]:
 def _errors(run: Survey) -> Iterator[Finding]:
     if run.accepted and not np.isfinite(run.columns["expected"]).any():
         yield Finding("no_errors", "No errors are known", *_why_no_errors(run), serious=False)
+    if words := faint_words(run.columns["faint"].to_numpy()):
+        yield Finding("faint", **words)
     if np.isfinite(run.factor) and run.frames.sizes["frame"] > 2 and not FACTOR[0] <= run.factor <= FACTOR[1]:
         more = run.factor > 1
         text = (
