@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
+import tifffile
 import zarr
 from conftest import Scene
+from files_classic import mrc
+from files_dm import write_dm
 
 from tract_dask import convert, estimate_drift, fit_columns, open_movie, sum_image
 from tract_dask.errors import SettingsError, SourceError
@@ -14,6 +18,7 @@ from tract_dask.run.inspect import describe
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, SourceSettings
 from tract_dask.stages.convert.defects import finder_for
 from tract_dask.stages.convert.origin import movie_key
+from tract_dask.stages.convert.references import check_references, read_references
 from tract_dask.store.schema import REJECTED
 
 LAYOUT = {"tile_px": 32, "shard_mb": 1}
@@ -157,7 +162,9 @@ def test_a_part_is_corrected_by_the_references_of_whole_frames(camera, movie, tm
     assert np.nanmean(found) == pytest.approx(np.nanmean(whole), rel=0.01)
 
 
-@pytest.mark.parametrize("text", ["x,y\n3,5\n7,9\n", "# bad\n3 5\n7 9\n", "y;note;x\n5;hot;3\n9;hot;7\n"])
+@pytest.mark.parametrize(
+    "text", ["x,y\n3,5\n7,9\n", "# bad\n3 5\n7 9\n", "y;note;x\n5;hot;3\n9;hot;7\n", '"x","y",\n"3","5",\n7.0,9\n']
+)
 def test_defects_as_a_list(camera, tmp_path, text):
     (tmp_path / "defects.txt").write_text(text)
     settings = ConvertSettings(**LAYOUT, find_defects=False, defects=str(tmp_path / "defects.txt"))
@@ -168,7 +175,8 @@ def test_defects_as_a_list(camera, tmp_path, text):
 @pytest.mark.parametrize(
     ("option", "values", "words"),
     [
-        ("dark", np.zeros((20, 30)), "160 x 144 px, as a frame of the movie has. Use|got 20 x 30"),
+        ("dark", np.zeros((20, 30)), "160 x 144 px, as a frame of the movie has; got 20 x 30 px. Use"),
+        ("dark", np.zeros((144, 160)), "Turn it by 90 degrees"),
         ("gain_reference", np.zeros((160, 144)), "not above 0"),
         ("defects", np.ones((160, 144), bool), "the other way round"),
     ],
@@ -181,7 +189,14 @@ def test_what_does_not_fit_is_refused(camera, tmp_path, option, values, words):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"), [("x,y\n3,200\n", "line 2.*no such pixel"), ("1,2\nhot,5\n", "line 2.*not a pixel")]
+    ("text", "words"),
+    [
+        ("x,y\n3,200\n", "line 2.*no such pixel"),
+        ("1,2\nhot,5\n", "line 2.*not a pixel"),
+        ("0,0,1,0\n0,1,0,0\n", "line 1.*4 words: 0 0 1 0.*save a mask as an image"),
+        ("7,0;5,0\n", "line 1.*not a pixel"),
+        ("x y\n1 7 5\n", "line 2.*3 words"),
+    ],
 )
 def test_a_wrong_line_of_a_list_is_named(camera, tmp_path, text, words):
     (tmp_path / "defects.csv").write_text(text)
@@ -195,18 +210,52 @@ def test_a_wrong_line_of_a_list_is_named(camera, tmp_path, text, words):
     [
         ({"dark": "dark", "gain_reference": "flat"}, "is inverted.*Use --gain-reference-by divide"),
         ({"dark": "dark", "gain_reference": "other"}, "do not have the pattern"),
+        (
+            {"dark": "dark", "gain_reference": "moved"},
+            r"otherwise.*1\.00 where.*move it by 2 px to the right and 1 px up\.$",
+        ),
+        ({"dark": "dark", "gain_reference": "flipped"}, "lies otherwise.*flip it top to bottom"),
+        (
+            {"dark": "dark", "gain_reference": "flipped flat"},
+            "turn it by 180 degrees, and use --gain-reference-by divide",
+        ),
+        ({"dark": "mirrored"}, "dark image lies otherwise.*flip it left to right"),
         ({"dark": "dark", "gain_reference": "gain", "defects": "defects", "movie": "even"}, "brighter than the frames"),
         ({"gain_reference": "gain", "defects": "defects", "movie": "even"}, "do not have the pattern"),
         ({"gain_reference": "gain"}, "do not have the pattern.*give --dark"),
     ],
 )
 def test_references_that_make_frames_worse_are_refused(camera, tmp_path, named, words):
-    camera.save("other", (1 / camera.sensitivity[::-1]).astype(np.float32))
+    other = np.random.default_rng(8).normal(1, PATTERN, camera.scene.shape)
+    camera.save("other", other.astype(np.float32))
+    camera.save("moved", np.roll(1 / camera.sensitivity, (1, -2), axis=(0, 1)).astype(np.float32))
+    camera.save("flipped", (1 / camera.sensitivity[::-1]).astype(np.float32))
+    camera.save("flipped flat", camera.sensitivity[::-1, ::-1].astype(np.float32))
+    camera.save("mirrored", camera.dark[:, ::-1].astype(np.float32))
     camera.save("even", camera.even)
     source = camera.path(named.pop("movie", "movie"))
     settings = ConvertSettings(**LAYOUT, **{name: camera.path(file) for name, file in named.items()})
     with pytest.raises(SourceError, match=words):
         finder_for(open_source(source), tmp_path, settings)
+
+
+def test_references_in_the_formats_of_cameras(camera, tmp_path):
+    movie = open_source(camera.path("movie"))
+    image = (2 / camera.sensitivity).astype(np.float32)
+    write_dm(tmp_path / "a.dm4", image)
+    tifffile.imwrite(tmp_path / "b.tif", image)
+    tifffile.imwrite(tmp_path / "c.gain", image)
+    mrc(tmp_path / "d.mrc", np.stack([image - 1, image + 1]), 2)
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        file["corrections/gain"] = image
+    for name in ("a.dm4", "b.tif", "c.gain", "d.mrc", "e.h5::/corrections/gain"):
+        settings = ConvertSettings(gain_reference=str(tmp_path / name))
+        check_references(movie, settings, MetadataSettings())
+        found = read_references(movie, settings).gain
+        np.testing.assert_allclose(found, camera.sensitivity.mean() / camera.sensitivity, rtol=1e-5)
+    image.tofile(tmp_path / "f.raw")
+    with pytest.raises(SourceError, match=r"raw file cannot be a reference.*Save it as"):
+        check_references(movie, ConvertSettings(dark=str(tmp_path / "f.raw")), MetadataSettings())
 
 
 def test_an_offset_is_not_subtracted_twice(camera, tmp_path):

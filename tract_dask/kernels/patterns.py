@@ -23,6 +23,7 @@ _BLOCK_PX = 16
 _FEWEST_BLOCKS = 16
 _OUTLIER = 8.0
 _NO_PATTERN = 1e-4
+_LARGEST_PX = 1024
 
 
 class Measured(NamedTuple):
@@ -72,10 +73,33 @@ def likeness(mean: Floats, sensitivity: Floats) -> Measured | None:
 
     -1 where the mean has its inverse, 0 where it has nothing of it. None where the sensitivity has no pattern.
     """
-    seen, known = fine(mean), fine(sensitivity)
-    level = _smooth(mean)[_INSIDE, _INSIDE]
-    good = _usual(seen) & np.isfinite(known) & np.isfinite(level) & (level > 0)
-    pattern, seen, level = known[good], seen[good], level[good]
+    return _share(fine(mean), fine(sensitivity), _smooth(mean)[_INSIDE, _INSIDE])
+
+
+def added_likeness(mean: Floats, dark: Floats) -> Measured | None:
+    """Return how much of the pattern of a dark image is in a mean of frames (both (y, x)), as :func:`likeness`."""
+    added = fine(dark)
+    return _share(fine(mean), added, np.ones_like(added))
+
+
+def shift_of(mean: Floats, image: Floats) -> tuple[int, int]:
+    """Return how far (y, x) an image's pattern lies from where a mean of frames (both (y, x)) shows it, or its inverse.
+
+    Of large frames the middle is compared.
+    """
+    rows, columns = (slice(max(0, side - _LARGEST_PX) // 2, (side + _LARGEST_PX) // 2) for side in mean.shape)
+    seen, known = (fine(one[rows, columns]) for one in (mean, image))
+    spectra = (np.fft.rfft2(np.where(_usual(one), one, 0)) for one in (seen, known))
+    likeness_at = np.abs(np.fft.irfft2(next(spectra) * np.conj(next(spectra)), seen.shape))
+    best = np.unravel_index(np.argmax(likeness_at), likeness_at.shape)
+    y, x = (int(at) if at <= side // 2 else int(at) - side for at, side in zip(best, seen.shape, strict=True))
+    return y, x
+
+
+def _share(seen: Floats, pattern: Floats, level: Floats) -> Measured | None:
+    """Return the slope of what is seen against ``pattern * level``, where the noise grows as the level."""
+    good = _usual(seen) & np.isfinite(pattern) & np.isfinite(level) & (level > 0)
+    pattern, seen, level = pattern[good], seen[good], level[good]
     weight = float((level * pattern**2).sum())
     if good.sum() < _FEWEST_BLOCKS * _BLOCK_PX**2 or (pattern**2).mean() < _NO_PATTERN**2:
         return None

@@ -15,7 +15,7 @@ from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 
-from ..errors import SourceError
+from ..errors import SettingsError, SourceError
 from ..settings.run import MetadataSettings, SourceSettings
 from .checks import Permit, checked_file, reading
 from .movie_files import FileList, is_pattern, list_files
@@ -38,6 +38,7 @@ __all__ = [
     "is_movie_folder",
     "list_files",
     "open_cached",
+    "open_reference",
     "open_source",
 ]
 
@@ -48,6 +49,9 @@ _RAW = READERS[".raw"]
 
 _OPTIONS = {"dark": "--dark", "gain": "--gain-reference", "defects": "--defects"}
 """What applies the references that lie beside a movie."""
+
+_GAIN_SUFFIX = ".gain"
+"""TIFF images that hold the gain references of Falcon cameras."""
 
 _NO_REFERENCE = (".xml", ".txt")
 """Descriptions of cameras, which are no images and no lists of pixels."""
@@ -98,6 +102,30 @@ def open_source(
     listed = tuple(place) if isinstance(place, list) else ()
     part = select(replace(source, path=name, metadata=merged, listed=listed, permit=permit), settings)
     return replace(part, metadata=overridden(part.metadata, metadata, settings))
+
+
+def open_reference(path: str, *, permit: Permit | None = None) -> FrameSource:
+    """Open an image of the detector, or several, as :func:`open_source`; files of Falcon cameras in ``.gain`` are TIFF.
+
+    Raises
+    ------
+    SourceError
+        As :func:`open_source`; also for raw files, which do not say what shape they have.
+    """
+    suffix = Path(_split(path)[0]).suffix.lower()
+    if suffix == _GAIN_SUFFIX:
+        checked_file(Path(path), permit)
+        return replace(_opened(READERS[".tif"], Path(path), "", DECLARED_NOTHING, permit), permit=permit)
+    try:
+        return open_source(path, permit=permit)
+    except SettingsError as error:  # only raw files have to be declared
+        raise SourceError(
+            "a raw file cannot be a reference",
+            path,
+            "a format that says what shape and type it holds",
+            error.what,
+            "Save it as NumPy, TIFF or MRC",
+        ) from error
 
 
 def _not_applied(known: SourceMetadata) -> tuple[str, ...]:

@@ -17,7 +17,8 @@ from ...readers.source import FrameSource
 from ...settings.run import ConvertSettings
 from ...store.arrays import DamagedArrayError, load_saved, save_array
 from ...store.pixels import NO_PIXELS, Pixels
-from .references import check_fits, read_references
+from .reference_checks import check_fits
+from .references import read_references
 
 _SAMPLE_FRAMES = 32
 FEWEST_FRAMES = 6

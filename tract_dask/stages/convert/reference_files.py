@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import SourceError
-from ...readers import open_source
+from ...readers import open_reference
 from ...readers.checks import Permit, checked_file, reading
 from ...readers.selection import SelectedSource
 from ...readers.source import FrameSource
@@ -51,7 +51,7 @@ def content_of_reference(place: str, permit: Permit | None = None) -> tuple[str,
         checked_file(Path(place), permit)
         with reading(place):
             return fingerprint(Path(place)), ""
-    with closing(open_source(place, permit=permit)) as image, reading(place):
+    with closing(open_reference(place, permit=permit)) as image, reading(place):
         return fingerprint(*image.files), image.inside
 
 
@@ -66,7 +66,7 @@ def check_reference(place: str, movie: FrameSource) -> None:
     if is_list(place):
         _listed(Path(place), _whole(movie).shape[1:], movie.permit)
         return
-    with closing(open_source(place, permit=movie.permit)) as image:
+    with closing(open_reference(place, permit=movie.permit)) as image:
         _check_shape(place, image.shape, movie)
 
 
@@ -78,7 +78,7 @@ def read_reference(place: str, movie: FrameSource) -> Image:
     SourceError
         Where it is not there, cannot be read, or has another shape than the frames.
     """
-    with closing(open_source(place, permit=movie.permit)) as image:
+    with closing(open_reference(place, permit=movie.permit)) as image:
         _check_shape(place, image.shape, movie)
         n_frames, total = image.shape[0], np.zeros(image.shape[1:])
         step = max(1, _BLOCK_BYTES // max(1, total.nbytes))
@@ -127,14 +127,17 @@ def _whole(movie: FrameSource) -> FrameSource:
 
 
 def _check_shape(place: str, found: tuple[int, int, int], movie: FrameSource) -> None:
-    fitting = {_whole(movie).shape[1:]: "a frame of the movie", movie.shape[1:]: "the part of it that is read"}
+    fitting = {movie.shape[1:]: "the part of it that is read", _whole(movie).shape[1:]: "a frame of the movie"}
     if found[1:] not in fitting:
+        turned = found[:0:-1] in fitting
         raise SourceError(
             "the reference has another shape than the frames",
             place,
             " or ".join(f"{rows} x {columns} px, as {what} has" for (rows, columns), what in fitting.items()),
             f"{found[1]} x {found[2]} px",
-            "Use the reference of this camera at this binning, cut to the field that was recorded",
+            "Turn it by 90 degrees, as the frames are"
+            if turned
+            else "Use the reference of this camera at this binning, cut to the field that was recorded",
         )
 
 
@@ -148,26 +151,49 @@ def _listed(path: Path, shape: tuple[int, ...], permit: Permit | None) -> NDArra
             "the list of pixels cannot be read", os.fspath(path), got=str(error), remedy=_MEANING
         ) from error
     mask = np.zeros(shape, bool)
-    names: tuple[str, ...] = ("x", "y")
-    first = True
+    names: tuple[str, ...] | None = None
     for number, line in enumerate(text.splitlines(), 1):
-        words = tuple(re.split(r"\s*[,;\s]\s*", line.strip().lower()))
-        if not line.strip() or line.lstrip().startswith("#"):
+        words = _words(line)
+        if not words or words[0].startswith("#"):
             continue
-        if first and {"x", "y"} <= set(words):
+        if names is None and {"x", "y"} <= set(words):
             names = words
-        else:
-            x, y = _place(dict(zip(names, words, strict=False)), words, shape, f"{path}, line {number}")
-            mask[y, x] = True
-        first = False
+            continue
+        names = names or ("x", "y")
+        x, y = _place(names, words, shape, f"{path}, line {number}")
+        mask[y, x] = True
     return mask
 
 
-def _place(row: dict[str, str], words: tuple[str, ...], shape: tuple[int, ...], where: str) -> tuple[int, int]:
+def _words(line: str) -> tuple[str, ...]:
+    """Return what stands in a line between commas, semicolons or white space, without quotes and empty ends.
+
+    Examples
+    --------
+    >>> _words('"3"; "5";')
+    ('3', '5')
+    """
+    words = [word.strip('"').strip() for word in re.split(r"\s*[,;\s]\s*", line.strip().lower())]
+    while words and not words[-1]:
+        del words[-1]
+    return tuple(words)
+
+
+def _place(names: tuple[str, ...], words: tuple[str, ...], shape: tuple[int, ...], where: str) -> tuple[int, int]:
+    row = dict(zip(names, words, strict=False))
     try:
+        if len(words) > len(names):
+            raise ValueError  # which of them are x and y?
         x, y = float(row["x"]), float(row["y"])
     except (KeyError, ValueError):
-        raise SourceError("this is not a pixel", where, "two whole numbers", " ".join(words)[:80], _MEANING) from None
+        found = " ".join(words)
+        raise SourceError(
+            "this is not a pixel",
+            where,
+            "two whole numbers, or as many words as a first line names, x and y among them",
+            f"{len(words)} words: {found[:80]}" if len(words) > len(names) else found[:80],
+            f"{_MEANING}; save a mask as an image",
+        ) from None
     if not (x.is_integer() and y.is_integer() and 0 <= x < shape[1] and 0 <= y < shape[0]):
         raise SourceError(
             "there is no such pixel in the frames",

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ...errors import MissingSourceError, SettingsError, SourceError
 from ...kernels.defects import USER
-from ...kernels.patterns import likeness
 from ...readers.checks import Permit
 from ...readers.source import FrameSource
 from ...settings.declare import option
@@ -27,9 +26,6 @@ from .reference_files import check_reference, content_of_reference, in_part, rea
 NAMES = ("dark", "gain_reference", "defects")
 """The settings that name references."""
 
-_SAMPLE_FRAMES = 32
-_SURE = 5.0
-"""Standard errors by which a reference has to be wrong."""
 _UNLIKE = 4.0
 """A pixel whose sensitivity differs so many times from the usual one is faulty."""
 
@@ -117,65 +113,14 @@ def read_references(movie: FrameSource, settings: ConvertSettings) -> Pixels:
         dark = np.where(np.isfinite(level), level, 0).astype(np.float32)
     if settings.gain_reference is not None:
         image = read_reference(settings.gain_reference, movie)
-        found = in_part(_sensitivity(image, settings.gain_reference, settings.gain_reference_by), movie)
+        found = in_part(sensitivity(image, settings.gain_reference, settings.gain_reference_by), movie)
         faulty |= np.isnan(found).any(axis=2)
         gain = np.where(faulty, 1, 1 / np.where(faulty, 1, found.mean(axis=2))).astype(np.float32)
     mask = np.where(faulty, np.uint8(USER), np.uint8(0)) if faulty.any() else None
     return Pixels(mask=mask, dark=dark, gain=gain)
 
 
-def check_fits(movie: FrameSource, settings: ConvertSettings, references: Pixels) -> None:
-    """Check on the mean of some frames that references make them better: that they are this camera's, and not applied.
-
-    Raises
-    ------
-    SourceError
-        Where the dark image is brighter than the frames, or where the gain reference would add a pattern.
-    """
-    if references.dark is None and references.gain is None:
-        return
-    mean = _sample_mean(movie)
-    if references.mask is not None:
-        mean[references.mask > 0] = np.nan
-    if references.dark is not None:
-        mean -= references.dark
-        good = mean[np.isfinite(mean)]
-        if good.size and good.mean() < -_SURE * good.std() / np.sqrt(good.size):
-            raise SourceError(
-                "the dark image is brighter than the frames",
-                str(settings.dark),
-                "an image without electrons, with the exposure of a frame",
-                f"frames that are {-good.mean():.4g} darker than it in the mean",
-                "Take a dark image of this exposure, or leave out --dark where frames were corrected before",
-            )
-    found = None if references.gain is None else likeness(mean, 1 / references.gain.astype(np.float64))
-    if found and found.value + _SURE * found.stderr < 0.5:
-        inverted = found.value < -0.5
-        other = "divide" if settings.gain_reference_by == "multiply" else "multiply"
-        raise SourceError(
-            "the gain reference is inverted"
-            if inverted
-            else "the frames do not have the pattern of the gain reference",
-            str(settings.gain_reference),
-            "a pattern that it takes away (1.00 of it is in the frames)",
-            f"{found.value:.2f} of it, with an error of {found.stderr:.2f}",
-            f"Use --gain-reference-by {other}"
-            if inverted
-            else "Leave it out where frames were corrected before; else turn it as the frames are, or give --dark",
-        )
-
-
-def _sample_mean(movie: FrameSource) -> NDArray[np.float64]:
-    """Return the mean (y, x) of at most 32 frames, spread over the movie."""
-    n_frames = movie.shape[0]
-    numbers = np.unique(np.linspace(0, n_frames - 1, min(n_frames, _SAMPLE_FRAMES)).astype(int)).tolist()
-    total = np.zeros(movie.shape[1:])
-    for number in numbers:
-        total += movie.read(number, number + 1)[0]
-    return total / len(numbers)
-
-
-def _sensitivity(image: NDArray[np.float64], place: str, by: str) -> NDArray[np.float64]:
+def sensitivity(image: NDArray[np.float64], place: str, by: str) -> NDArray[np.float64]:
     """Return the sensitivity of pixels, of mean 1; NaN where a pixel has none, or one that is out of all proportion."""
     good = np.isfinite(image) & (image > 0)
     if good.mean() < 0.5:
