@@ -410,9 +410,22 @@ def test_shards_that_change_places_are_named(copy, first, second):
     found = verify(copy)
     assert {fault.file for fault in found.faults if fault.what == "damaged"} == {first, second}
     assert all("belongs to another place" in fault.why for fault in found.faults)
-    if "movie" in str(first):
-        with pytest.raises(StoreError, match="belongs to another place"):
-            read_movie(copy / "movie.zarr")
+    store = copy / first.relative_to(copy).parts[0]
+    reads = [lambda: read(store)]
+    if store.stem == "results":
+        reads += [lambda: open_results(store)["stderr"][:1, :1].load(), lambda: datasets.open_array(second.parent)[0]]
+    for look in reads:
+        with pytest.raises(StoreError, match="belongs to another place") as error:
+            look()
+        assert Path(error.value.where) in (first, second)
+
+
+def test_results_of_a_run_without_marks_are_read(copy):
+    """Stores of earlier releases have none."""
+    store = copy / "results.zarr"
+    marked = open_results(store).load()
+    rewritten(store, lambda about: about.pop("shards_marked"))
+    xr.testing.assert_equal(open_results(store).load(), marked)
 
 
 def test_stores_of_two_runs_in_one_folder_are_named(run, copy, tmp_path):

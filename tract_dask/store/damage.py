@@ -1,23 +1,13 @@
-"""What is damaged, said so: the file, its frames, and what makes it whole again; no chunk is taken on trust.
-
-Zarr fills a chunk that is missing with the fill value. Arrays that are read through :class:`CheckedPipeline` raise.
-"""
+"""What is damaged, said so: the file, its frames, and what makes it whole again."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from zarr.abc.store import ByteGetter, ByteRequest
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.core.codec_pipeline import BatchedCodecPipeline
-from zarr.registry import register_pipeline
-from zarr.storage import LocalStore, StorePath
 
 from ..errors import StoreError
 from .files import read_small
@@ -118,61 +108,3 @@ def remedy(file: Path) -> str:
             "--columns-csv"
         )
     return f"Remove {store} and {again}: nothing else is made again"
-
-
-class _MissingError(ValueError):
-    """A chunk is not there."""
-
-
-@dataclass(frozen=True)
-class _Whole:
-    """Gives the bytes of a chunk, which has to be there."""
-
-    inner: Any
-
-    async def get(self, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        found: Buffer | None = await self.inner.get(prototype, byte_range)
-        if found is None:
-            raise _MissingError("no such file")
-        if not len(found):  # for Zarr an empty shard is one without tiles
-            raise ValueError("the file is empty, or ends too early")
-        return found
-
-
-def _is_file(place: object) -> bool:
-    """Tell whether bytes come from a file of their own, not from inside a shard."""
-    return isinstance(place, StorePath) and isinstance(place.store, LocalStore)
-
-
-class CheckedPipeline(BatchedCodecPipeline):
-    """Zarr's own pipeline, but for errors: they name the file, and a chunk that is missing is one.
-
-    The tiles inside a shard are read by Zarr's own: its index, which has a checksum, says where they are.
-    """
-
-    async def read(
-        self, batch_info: Iterable[tuple[ByteGetter, Any, Any, Any, bool]], out: Any, drop_axes: tuple[int, ...] = ()
-    ) -> None:
-        """Read chunks into ``out``."""
-        items: list[Any] = [(_Whole(getter), *rest) for getter, *rest in batch_info]
-        try:
-            await super().read(items, out, drop_axes)
-        except (OSError, ValueError, RuntimeError):
-            if not all(_is_file(item[0].inner) for item in items):
-                raise
-            for item in items:  # which one was it?
-                await self._read_one(item, out, drop_axes)
-
-    async def _read_one(self, item: Any, out: Any, drop_axes: tuple[int, ...]) -> None:
-        place = item[0].inner
-        with reading(place.store.root / place.path):
-            try:
-                await super().read([item], out, drop_axes)
-            except _MissingError as error:
-                raise FileNotFoundError from error
-
-
-register_pipeline(CheckedPipeline)
-
-CHECKED = {"codec_pipeline.path": f"{CheckedPipeline.__module__}.{CheckedPipeline.__qualname__}"}
-"""Zarr's configuration in which arrays are opened that are to be whole."""

@@ -16,7 +16,8 @@ from zarr.storage import LocalStore
 
 from ..errors import MissingStoreError, StoreError
 from . import disk
-from .damage import CHECKED, METADATA, damaged, reading, unreadable
+from .checked import CHECKED
+from .damage import METADATA, damaged, reading, unreadable
 from .files import disk_errors, remove
 from .held import check_held
 from .metadata import FORMAT, attributes, check_named, check_nodes, format_of, seal

@@ -1,0 +1,115 @@
+"""How Zarr reads the arrays of a complete store: a chunk that is missing is an error, and so is one of another place.
+
+Zarr fills a chunk that is missing with the fill value, and does not know of the marks of shard files
+(:mod:`tract_dask.store.shard_files`). Arrays that are read through :class:`CheckedPipeline` raise, and name the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from zarr.abc.store import ByteGetter, ByteRequest
+from zarr.codecs import ShardingCodec
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.core.codec_pipeline import BatchedCodecPipeline
+from zarr.registry import register_pipeline
+from zarr.storage import LocalStore, StorePath
+
+from .damage import METADATA, reading, store_of
+from .metadata import attributes
+from .shard_files import MARKED, mark_of, read_index
+
+
+class _MissingError(ValueError):
+    """A chunk is not there."""
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """Gives the bytes of a chunk, which has to be there."""
+
+    inner: Any
+
+    async def get(self, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        found: Buffer | None = await self.inner.get(prototype, byte_range)
+        if found is None:
+            raise _MissingError("no such file")
+        if not len(found):  # for Zarr an empty shard is one without tiles
+            raise ValueError("the file is empty, or ends too early")
+        return found
+
+
+def _file(place: object) -> Path | None:
+    """Return the file that bytes come from; None where they come from inside a shard."""
+    if not isinstance(place, StorePath) or not isinstance(place.store, LocalStore):
+        return None
+    return place.store.root / place.path
+
+
+class CheckedPipeline(BatchedCodecPipeline):
+    """Zarr's own pipeline, but for errors: they name the file, and a chunk that is missing is one.
+
+    The tiles inside a shard are read by Zarr's own: its index, which has a checksum, says where they are. The mark
+    before the index says whether the file is in its place.
+    """
+
+    async def read(
+        self, batch_info: Iterable[tuple[ByteGetter, Any, Any, Any, bool]], out: Any, drop_axes: tuple[int, ...] = ()
+    ) -> None:
+        """Read chunks into ``out``."""
+        items: list[Any] = [(_Whole(getter), *rest) for getter, *rest in batch_info]
+        files = [_file(item[0].inner) for item in items]
+        if isinstance(self.array_bytes_codec, ShardingCodec):
+            for file, (_, spec, *_) in zip(files, items, strict=True):
+                if file is not None:
+                    tiles = zip(spec.shape, self.array_bytes_codec.chunk_shape, strict=True)
+                    _check_place(file, tuple(side // part for side, part in tiles))
+        try:
+            await super().read(items, out, drop_axes)
+        except (OSError, ValueError, RuntimeError):
+            if None in files:
+                raise
+            for file, item in zip(files, items, strict=True):  # which one was it?
+                await self._read_one(file, item, out, drop_axes)
+
+    async def _read_one(self, file: Any, item: Any, out: Any, drop_axes: tuple[int, ...]) -> None:
+        with reading(file):
+            try:
+                await super().read([item], out, drop_axes)
+            except _MissingError as error:
+                raise FileNotFoundError from error
+
+
+def _check_place(file: Path, tiles: tuple[int, ...]) -> None:
+    """Check that a shard file is the one of its place in its store.
+
+    Raises
+    ------
+    StoreError
+        Where it is another, is damaged, or cannot be read.
+    """
+    root = store_of(file) / METADATA
+    with reading(root):
+        about = root.stat()
+    key = _key_in_marks(root.parent, (about.st_ino, about.st_mtime_ns, about.st_size))
+    if key is not None:
+        array, number = file.parent.relative_to(root.parent).as_posix(), int(file.name.split(".")[1])
+        with reading(file), file.open("rb", buffering=0) as opened:
+            read_index(opened.fileno(), tiles, mark_of(key, array, number))
+
+
+@lru_cache(64)
+def _key_in_marks(store: Path, state: tuple[int, ...]) -> str | None:
+    """Return the key in the marks of a store's shard files, known while its root's state is; None without marks."""
+    about = attributes(store)
+    return about.get("key") or None if about.get(MARKED) else None
+
+
+register_pipeline(CheckedPipeline)
+
+CHECKED = {"codec_pipeline.path": f"{CheckedPipeline.__module__}.{CheckedPipeline.__qualname__}"}
+"""Zarr's configuration in which arrays are opened that are to be whole."""
