@@ -6,7 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B
-from .lattice import TOLERANCE, Lattice, Places, Reals, binned, smooth
+from .lattice import TOLERANCE, Lattice
+from .relief import Places, Reals, binned, smooth
 
 SIGNS = {"bright": 1, "dark": -1}
 """Of a column's amplitude, by the contrast."""

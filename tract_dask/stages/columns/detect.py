@@ -4,7 +4,7 @@ Unlike :func:`tract_dask.stages.columns.lattice.find_peaks` these methods know n
 image a map of strengths, in units of what white noise alone shows there, of which the local maxima are taken:
 
 - ``maxima``: the height above the surroundings after a blur of the columns' size
-  (:func:`tract_dask.stages.columns.lattice.relief`);
+  (:func:`tract_dask.stages.columns.relief.relief`);
 - ``blobs``: the negative Laplacian of a Gaussian at several scales, of each pixel the highest (Lindeberg, Int. J.
   Comput. Vis. 30 (1998) 79);
 - ``template``: the correlation coefficient r with the picture of a column (Lewis 1995, as in
@@ -39,7 +39,8 @@ from ...store.keys import stage_key
 from ...store.movie import Movie
 from ...store.shards import Shard
 from .contrast import SIGNS, chosen
-from .lattice import Mask, Places, Reals, Relief, binned, find_lattice, pixel_noise, relief
+from .lattice import find_lattice
+from .relief import Mask, Places, Reals, Relief, binned, pixel_noise, relief
 from .window_size import default_window
 
 METHODS = ("maxima", "blobs", "template")

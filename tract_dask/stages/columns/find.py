@@ -24,18 +24,8 @@ from ...store.schema import Status
 from ..filled import fill_holes
 from .contrast import SIGNS, chosen, support
 from .detect import METHODS, make_detector
-from .lattice import (
-    Lattice,
-    Places,
-    Relief,
-    damping,
-    find_lattice,
-    find_peaks,
-    pixel_noise,
-    relief,
-    sample,
-    without_holes,
-)
+from .lattice import Lattice, find_lattice, find_peaks, without_holes
+from .relief import Places, Relief, damping, pixel_noise, relief, sample
 from .sites import lattice_sites
 from .twins import twins_of
 from .window_size import default_blur, neighbour_distance, resolve_window, usual_sigma

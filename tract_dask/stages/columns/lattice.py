@@ -5,20 +5,15 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 from scipy.spatial import cKDTree
 
-from ...kernels.peaks import box_means, local_maxima
+from ...kernels.peaks import local_maxima
 from ...kernels.windows import blur
-
-Reals = NDArray[np.floating[Any]]
-Places = NDArray[np.float64]
-"""(n, 2) rows of (x, y), px."""
-Mask = NDArray[np.bool_]
+from .relief import Mask, Places, Reals, Relief, binned, coarseness, damping, expanded, sample, smooth
 
 TOLERANCE = 0.2
 """How far from its lattice site a column may be, in spacings."""
@@ -35,18 +30,12 @@ _LARGE = 1500
 """Shorter side, in px, from twice which on the image is binned before it is correlated."""
 _NOISIEST = 3.0
 """Correlation without a shift, which noise lifts above 1, up to which a lattice can be found."""
-_PX_PER_SPACING = 24
-"""Pixels on which the distance between columns is seen: peaks are looked for in an image binned so far."""
 _MARGIN = 3
 """The shortest shift, px, that may be a lattice vector."""
-_COARSE = 16
-"""Smoothing by so many px or more is done on bins of a sixteenth of it."""
 _LEVEL_BINS = 8
 """Bins in the reach of the background's median."""
 _HOLE_PX = 5
 """Holes less wide than this are those of single pixels, small clusters, and short lines of them."""
-_SAMPLE = 1 << 20
-"""Of more values than these, statistics are taken from a sample."""
 _STRONG = 0.5
 _ALIKE = 0.7
 _SIGNIFICANT = 4.0
@@ -78,34 +67,6 @@ class Lattice:
         """Return the lattice vectors of up to ``reach`` steps along each axis, without zero."""
         steps = [step for step in product(range(-reach, reach + 1), repeat=2) if step != (0, 0)]
         return np.asarray(np.array(steps, dtype=np.float64) @ np.array([self.a, self.b]))
-
-
-@dataclass(frozen=True)
-class Relief:
-    """An image in which columns stand out, of bins of ``step`` x ``step`` px; places are in px all the same.
-
-    Attributes
-    ----------
-    height
-        (y, x); columns bright, their surroundings about zero.
-    valid
-        (y, x) where the image has been exposed.
-    noise
-        Standard deviation of ``height`` where there is nothing.
-    """
-
-    height: Reals
-    valid: Mask
-    noise: float
-    step: int
-
-    def bins(self, places: Places) -> Places:
-        """Return places (x, y) in px as places in bins."""
-        return np.asarray((places + 0.5) / self.step - 0.5)
-
-    def px(self, places: Places) -> Places:
-        """Return places (x, y) in bins as places in px."""
-        return np.asarray((places + 0.5) * self.step - 0.5)
 
 
 def find_lattice(
@@ -164,38 +125,6 @@ def _shortest(shifts: Places, heights: Reals, least: float) -> Places | None:
     return shifts[min(high, key=lambda n: float(shifts[n] @ shifts[n]))] if len(high) else None
 
 
-def binned(image: Reals | Mask, step: int) -> Places:
-    """Return the means of blocks of ``step`` pixels, without the rest at the right and the bottom."""
-    ny, nx = (size // step for size in image.shape)
-    rows = image[: ny * step, : nx * step].reshape(ny, step, nx * step).mean(axis=1, dtype=np.float64)
-    return np.asarray(rows.reshape(ny, nx, step).mean(axis=2))
-
-
-def expanded(bins: Reals, shape: tuple[int, int], step: int, first: tuple[float, float]) -> Reals:
-    """Return ``bins`` on pixels, interpolated linearly; a product with two matrices of weights.
-
-    Parameters
-    ----------
-    shape
-        (y, x) of the result.
-    step
-        Pixels from one bin to the next.
-    first
-        Pixel (y, x) on which bin 0 lies. Beyond the bins their edge goes on.
-    """
-    bins = bins.astype(np.float32)
-    down, across = (
-        np.maximum(0.0, 1.0 - np.abs(np.clip((np.arange(n)[:, None] - start) / step, 0, m - 1) - np.arange(m)))
-        for n, m, start in zip(shape, bins.shape, first, strict=True)
-    )
-    return np.asarray(down.astype(np.float32) @ bins @ across.T.astype(np.float32))
-
-
-def sample(values: Reals) -> Reals:
-    """Return about a million of the values, evenly spaced, where there are more."""
-    return values[:: max(1, len(values) // _SAMPLE)]
-
-
 def _autocorrelation(image: Reals, valid: Mask, noise: float) -> tuple[Reals, Places]:
     """Return the heights and shifts (x, y) of the maxima of an image's autocorrelation, one of each opposite pair.
 
@@ -209,7 +138,7 @@ def _autocorrelation(image: Reals, valid: Mask, noise: float) -> tuple[Reals, Pl
     flat = np.where(valid, image - _level(image, wide), np.float32(0))
     flat = np.clip(flat, *np.percentile(sample(flat[valid]), [0.5, 99.5]).astype(np.float32)) * valid
     correlation = _correlate(flat)
-    step = _coarseness(wide)
+    step = coarseness(wide)
     share = binned(valid, step)
     power = smooth(binned(flat**2, step), wide / step) / np.maximum(smooth(share, wide / step), 1e-3)
     coarse = step**2 * _correlate(np.sqrt(np.maximum(power - noise**2, 0.0)) * share)
@@ -250,26 +179,11 @@ def _vertex(values: Reals, y: NDArray[np.int64], x: NDArray[np.int64], dy: int, 
     return np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
 
 
-def smooth(image: Reals, sigma: float) -> Reals:
-    """Return ``image`` smoothed by about a Gaussian of ``sigma`` px, three passes of a box; a wide one on bins."""
-    step = _coarseness(sigma)
-    radius = round((np.sqrt(4 * (sigma / step) ** 2 + 1) - 1) / 2)
-    bins = image if step == 1 else binned(image, step)
-    for _ in range(3):
-        bins = box_means(bins, radius)
-    return bins if step == 1 else expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
-
-
 def _level(image: Reals, reach: float) -> Reals:
     """Return the median of an image's surroundings, those within ``reach`` px along each axis, from bins."""
     step = max(1, int(reach / _LEVEL_BINS))
     bins = ndimage.median_filter(binned(image, step), 2 * round(reach / step) + 1, mode="nearest")
     return expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
-
-
-def _coarseness(sigma: float) -> int:
-    """Return how far an image may be binned before it is smoothed by ``sigma`` px."""
-    return max(1, int(sigma / _COARSE))
 
 
 def without_holes(there: Mask) -> Mask:
@@ -287,38 +201,6 @@ def without_holes(there: Mask) -> Mask:
     closed = ndimage.binary_closing(np.pad(there, side, mode="edge"), np.ones((_HOLE_PX, _HOLE_PX), np.bool_))
     whole: Mask = there | closed[side:-side, side:-side]
     return whole
-
-
-def pixel_noise(image: Reals, valid: Mask) -> float:
-    """Return the standard deviation of the white noise of an image, from its second differences (Immerkær 1996).
-
-    Of a large image some rows are taken.
-    """
-    ny, nx = image.shape
-    rows = np.arange(1, ny - 1, max(1, ny * nx // _SAMPLE))
-    bend = image[rows - 1] - 2 * image[rows] + image[rows + 1]
-    bend = np.abs(bend[:, :-2] - 2 * bend[:, 1:-1] + bend[:, 2:]) / 6
-    return float(np.median(bend[valid[rows, 1:-1]]) / 0.6745)
-
-
-def damping(sigma: float) -> float:
-    """Return the share of white noise's standard deviation that a Gaussian blur of ``sigma`` px leaves."""
-    return min(1.0, 1 / (2 * np.sqrt(np.pi) * sigma)) if sigma > 0 else 1.0
-
-
-def relief(
-    image: Reals, valid: Mask, noise: float, spacing: float, blur_sigma_px: float | None, precision_px: float = np.inf
-) -> Relief:
-    """Return the image in which columns ``spacing`` px apart stand out.
-
-    Binned to 24 px a spacing, but to no more than ``precision_px``; blurred to 0.08 of the spacing (a column is about
-    twice as wide), or ``blur_sigma_px`` where that is more; less the surroundings over a third of it.
-    """
-    step = max(1, int(min(spacing / _PX_PER_SPACING, precision_px)))
-    sigma = max(blur_sigma_px or 0.0, 0.08 * spacing) / step
-    fine = blur(binned(image, step).astype(np.float32), sigma)
-    height = (fine - smooth(fine, spacing / 3 / step)).astype(np.float32)
-    return Relief(height, binned(valid, step) == 1, damping(sigma) * noise / step, step)
 
 
 def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_amplitude: float) -> Places:
