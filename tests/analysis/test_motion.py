@@ -26,7 +26,7 @@ from tract_dask.analysis.motion import (
     standard_deviation,
     standard_errors,
 )
-from tract_dask.analysis.weights import _scatter, blocks
+from tract_dask.analysis.weights import blocks, scatter_of
 from tract_dask.errors import SettingsError
 from tract_dask.kernels.changepoints import critical_penalty, plateaus
 from tract_dask.kernels.gaussian import parameters
@@ -187,8 +187,8 @@ def test_errors_follow_the_dose_and_a_column_that_changes():
 def test_a_column_by_itself_does_not_alarm_more_often():
     """The error of the noise factor counts: one column of 40 frames knows its noise to about 14 %."""
     alarms, draws = 0, 1500
-    for places in still(40, draws, seed=8).transpose(1, 0, 2):
-        variance, error = _scatter(places, np.ones((40, 2)))
+    series = still(40, draws, seed=8).transpose(1, 0, 2)
+    for places, (variance, error) in zip(series, scatter_of(series, np.ones(series.shape)), strict=True):
         degrees = 2 / (np.pi / 2 * error)  # as noise_factor has it for one column
         alarms += len(_jumps(places, np.full((40, 2), np.exp(variance / 2)), degrees, 0.9, 2)[0]) > 0
     assert alarms <= stats.binom.ppf(0.9995, draws, 0.12)
@@ -279,7 +279,7 @@ def test_noise_factor_of_columns_that_differ_and_of_those_that_do_not():
 
 def test_noise_of_one_column_is_known_as_well_as_it_says():
     places = np.swapaxes(still(60, 800), 0, 1)
-    found = np.array([_scatter(place, np.full((60, 2), 2.0)) for place in places])
+    found = scatter_of(places, np.full(places.shape, 2.0))
     np.testing.assert_allclose(found[:, 0].var(), found[0, 1], rtol=0.2)  # 800 draws: 5 % standard error
 
 

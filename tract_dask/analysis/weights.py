@@ -16,6 +16,7 @@ import xarray as xr
 from scipy.ndimage import median_filter
 
 from ..kernels.gaussian.intensity import Floats
+from ..stages.fit.common_motion import masked_median
 
 _BLOCK_BYTES = 128 << 20
 """Columns are read in blocks of so many bytes: places and errors of all their frames."""
@@ -64,16 +65,15 @@ def steady(errors: Floats, course: Floats) -> Floats:
     course
         (frame,) what the columns have in common, about 1.
     """
-    found = np.full(errors.shape, np.nan)
     known = np.isfinite(errors) & (errors > 0)
-    for column, axis in np.ndindex(errors.shape[0], errors.shape[2]):
-        frames = np.flatnonzero(known[column, :, axis])
-        if len(frames):
-            level = errors[column, frames, axis] / course[frames]
-            wide = len(level) > _AROUND
-            level = median_filter(level, _AROUND) if wide else np.full(len(level), np.median(level))
-            found[column, :, axis] = np.interp(np.arange(errors.shape[1]), frames, level) * course
-    return found
+    levels = np.where(known, errors, np.nan) / course[:, None]
+    by_axis, seen = np.swapaxes(levels, 1, 2), np.swapaxes(known, 1, 2)  # (column, axis, frame)
+    found = np.repeat(masked_median(by_axis, seen)[..., None], errors.shape[1], axis=2)
+    for column, axis in np.argwhere(seen.sum(axis=2) > _AROUND):
+        frames = np.flatnonzero(seen[column, axis])
+        level = median_filter(by_axis[column, axis, frames], _AROUND)
+        found[column, axis] = np.interp(np.arange(errors.shape[1]), frames, level)
+    return np.swapaxes(found, 1, 2) * course[:, None]
 
 
 def scatter_of(places: Floats, errors: Floats) -> Floats:
@@ -82,8 +82,23 @@ def scatter_of(places: Floats, errors: Floats) -> Floats:
     That is the logarithm of the variance of first differences in units of the stated one, and the variance of that
     logarithm; NaN where there are no two frames.
     """
-    found = [_scatter(place, error) for place, error in zip(places, errors, strict=True)]
-    return np.array(found).reshape(-1, 2)
+    known = np.isfinite(places).all(axis=2) & (errors > 0).all(axis=2)
+    order = np.argsort(~known, axis=1, kind="stable")[..., None]  # known frames to the front
+    place, variance = (np.take_along_axis(values, order, axis=1) for values in (places, errors**2))
+    with np.errstate(invalid="ignore"):
+        away = np.abs(np.diff(place, axis=1) / np.sqrt(variance[:, 1:] + variance[:, :-1]))
+    pairs = np.arange(1, known.shape[1]) < known.sum(axis=1)[:, None]
+    counted = np.repeat(pairs, away.shape[2], axis=1)
+    away = np.where(counted, away.reshape(len(away), -1), np.inf)
+    middle = masked_median(away, counted)
+    sd = 1.4826 * np.where(middle > 0, middle, np.nan)
+    squares = np.where(counted, away, 0.0) ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for _ in range(10):
+            within = away <= _CUT * sd[:, None]
+            sd = np.sqrt((squares * within).sum(axis=1) / within.sum(axis=1) / _CUT_VARIANCE)
+        variance_of_log = np.where(np.isfinite(sd), 2 * _CORRELATED / counted.sum(axis=1), np.nan)
+    return np.column_stack([2 * np.log(sd), variance_of_log])
 
 
 def drawn_together(scatters: Floats) -> tuple[Floats, Floats]:
@@ -135,16 +150,3 @@ def _common_course(error: xr.DataArray) -> Floats:
         return np.ones(n_frames)
     course = np.interp(np.arange(n_frames), seen, course[seen])
     return np.asarray(median_filter(course, width), np.float64)
-
-
-def _scatter(place: Floats, error: Floats) -> tuple[float, float]:
-    """Return the logarithm of a column's variance in units of its stated one, and the variance of that logarithm."""
-    known = np.isfinite(place).all(axis=1) & (error > 0).all(axis=1)
-    variance = error[known] ** 2
-    differences = np.abs(np.diff(place[known], axis=0) / np.sqrt(variance[1:] + variance[:-1])).ravel()
-    if not len(differences) or not np.median(differences) > 0:
-        return np.nan, np.nan
-    sd = 1.4826 * float(np.median(differences))
-    for _ in range(10):
-        sd = float(np.sqrt(np.mean(differences[differences <= _CUT * sd] ** 2) / _CUT_VARIANCE))
-    return 2 * np.log(sd), 2 * _CORRELATED / len(differences)

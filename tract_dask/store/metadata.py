@@ -149,7 +149,7 @@ def write_root(path: Path, metadata: dict[str, Any], changed: Collection[str] = 
     metadata = json_ready(metadata)
     ours = metadata["attributes"][ATTRIBUTE]
     ours["checksum"] = digest(metadata)
-    write_aside(path / METADATA, json.dumps(metadata, indent=2).encode())
+    write_aside(path / METADATA, json.dumps(metadata).encode())
 
 
 def seal(path: Path) -> None:

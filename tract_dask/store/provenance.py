@@ -8,7 +8,7 @@ import json
 import platform
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any
@@ -67,16 +67,21 @@ def _samples(sizes: list[int]) -> Iterator[tuple[int, int, int]]:
 
 def provenance(key: str, settings: Settings, source: str = "") -> dict[str, Any]:
     """Return what every store carries about its making, ready to be stored as attributes."""
-    packages = ("tract_dask", "numpy", "numba", "zarr", "dask")
     return {
         "key": key,
         "settings": to_toml(settings),
         "source": source,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "processor": processor(),
-        "versions": {"python": platform.python_version()}
-        | {name: importlib.metadata.version(name) for name in packages},
+        "versions": versions(),
     }
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that make results."""
+    packages = ("tract_dask", "numpy", "numba", "zarr", "dask")
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in packages}
 
 
 _LANES = " lanes"
