@@ -88,7 +88,8 @@ def test_gain_and_offset_are_those_of_the_camera(gain, offset, read, dtype):
 
 
 @pytest.mark.parametrize(
-    ("sigma", "electrons", "contrast"), [(0.8, 20.0, 1.0), (1.1, 60.0, 1.0), (2.0, 100.0, 3.0), (2.0, 1000.0, 3.0)]
+    ("sigma", "electrons", "contrast"),
+    [(0.8, 20.0, 1.0), (1.1, 60.0, 1.0), (2.0, 100.0, 3.0), (2.0, 1000.0, 3.0), (3.0, 100.0, 3.0)],
 )
 def test_sharp_or_bright_columns_that_drift_over_the_pixels_are_no_noise(sigma, electrons, contrast):
     """The gain is right within 10 %, or not known; with their motion it was up to 2.3 times too large."""

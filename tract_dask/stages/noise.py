@@ -38,8 +38,9 @@ _SHARPEST_PX2 = 0.3
 """Variance of the sharpest image that is expected; noise in the level looks sharper."""
 _USUAL_MOTION_PX2 = 0.2**2
 _FEWEST_PIXELS = 1 << 14
-_SURE = 0.1
-"""Gain and offset are known where their error is below this share (of itself; of the usual level)."""
+_SURE = 0.05
+"""Gain and offset are known where their error is below this share (of itself; of the usual level). What moves leaves up
+to twice the error."""
 _SURE_OFFSET = 0.05
 
 
