@@ -186,6 +186,19 @@ def test_beginning_anew_keeps_them_with_the_same_movie_and_puts_them_away_with_a
     assert folder.table.with_stem("columns-edited").read_text() == edited
 
 
+def test_places_that_count_from_another_pixel_are_put_away_and_other_frames_keep_them(folder):
+    """The same table in another field, or in sums of pixels, would mean other places: half of it off the columns."""
+    edited = folder.edit()
+    assert folder.run(change(source={"frames": "2:"}), overwrite=True, until="columns").columns == N_COLUMNS - 3
+    assert folder.table.read_text() == edited
+    assert folder.run(change(source={"roi": "0:160,11:144"}), overwrite=True, until="columns").columns == N_COLUMNS
+    assert folder.table.with_stem("columns-edited").read_text() == edited
+    assert any("columns-edited.csv" in warning for warning in folder.warnings)
+    again = folder.edit(dropped=2)  # counted from there now
+    folder.run(change(source={"roi": "0:160,11:144"}), until="columns")
+    assert folder.table.read_text() == again
+
+
 def test_a_version_of_the_service_outlives_changes_too(folder):
     outputs = run_folder.RunFolder(folder.root)
     edited = folder.edit()

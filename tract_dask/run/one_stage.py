@@ -79,13 +79,13 @@ def run_columns(
     settings, path, opened = with_whole_paths(settings or RunSettings()), Path(output).absolute(), open_movie(movie)
     check_suffix(path, ".csv")
     check_columns(opened.shape[1:], settings.columns, settings.fit.window_px)
-    check_edited(path, settings.columns, opened.shape[1:])
+    check_edited(path, settings.columns, opened.shape[1:], opened.part)
     shift = None if drift is None else datasets.open_dataset(Path(drift))
     with Session(str(movie), path, settings.cluster, client, on_event) as session:
         attempt, send = session.attempt, session.send
         summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), session.workers, send))
         find = partial(columns_stage, summed, path, settings.columns, settings.fit, send, draw=draw_columns)
-        return attempt(partial(find, overwrite=overwrite))
+        return attempt(partial(find, part=opened.part, overwrite=overwrite))
 
 
 def run_fit(
@@ -112,5 +112,6 @@ def run_fit(
         summed = attempt(partial(sum_stage, opened, shift, sum_beside(path), workers, send))
         opened = open_movie(movie)  # its gain and offset may have been measured
         csv = path.with_name(f"{path.stem}_columns.csv")
-        found = attempt(partial(columns_stage, summed, csv, chosen, settings.fit, send, draw=draw_columns))
+        find = partial(columns_stage, summed, csv, chosen, settings.fit, send, draw=draw_columns)
+        found = attempt(partial(find, part=opened.part))
         return attempt(partial(fit_stage, opened, found, shift, summed, path, settings.fit, workers, send))

@@ -111,7 +111,7 @@ def run(
         Takes the run's progress. What it raises ends the run, which goes on from there as after any other error.
     overwrite
         Begin anew, even where the folder holds something else, or a movie that was converted otherwise. A table of
-        columns that was edited by hand stays, with the same movie, or is put away.
+        columns that was edited by hand stays, with the same movie, field and bin, or is put away.
     plan_only
         Only plan, and write nothing.
     report
@@ -151,7 +151,8 @@ def run(
             if overwrite:
                 same = attempt(lambda: metadata.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened))
                 attempt(partial(clear_run, outputs, on_event, keep_edited=same))
-            attempt(partial(check_edited, outputs.columns, settings.columns, opened.shape[1:]))
+            part = opened.metadata.part and dataclasses.asdict(opened.metadata.part)
+            attempt(partial(check_edited, outputs.columns, settings.columns, opened.shape[1:], part))
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 
 
@@ -227,8 +228,8 @@ def _stages(
     def draw(image: xr.Dataset, found: xr.Dataset, figure: Path) -> None:
         session.aside(partial(draw_columns, image, found, figure))
 
-    find = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send, draw=draw)
-    made.columns = columns = attempt(find)
+    find = partial(columns_stage, summed, outputs.columns, settings.columns, settings.fit, send)
+    made.columns = columns = attempt(partial(find, part=movie.part, draw=draw))
     yield "columns"
     made.summary = attempt(
         partial(fit_stage, movie, columns, drift, summed, outputs.results, settings.fit, workers, send)

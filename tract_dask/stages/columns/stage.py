@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, count
@@ -41,13 +41,19 @@ def columns_stage(
     on_event: Sink = silent,
     *,
     overwrite: bool = False,
+    part: Mapping[str, int] | None = None,
     draw: Draw,
 ) -> xr.Dataset:
     """Return the columns of a summed image, kept as the table ``csv``, with ``.zarr`` and ``.png`` of the same name.
 
     Where the table was edited by hand since, its columns are refined and returned instead, and the table is left
-    as it is, whatever other setting changes; only another method or file of columns takes its place, after it was put
-    away. The figure is drawn by ``draw``.
+    as it is, whatever other setting changes; only another method or file of columns, or another field or bin of the
+    movie, takes its place, after it was put away. The figure is drawn by ``draw``.
+
+    Parameters
+    ----------
+    part
+        Which part of its source the movie is, as :attr:`tract_dask.store.movie.Movie.part` says.
 
     Raises
     ------
@@ -59,7 +65,7 @@ def columns_stage(
     store, figure = csv.with_suffix(".zarr"), csv.with_suffix(".png")
     window, blur = fit_settings.window_px, fit_settings.blur_sigma_px
     find = partial(find_columns, summed, window_px=window, blur_sigma_px=blur)
-    before = _Table.read(csv, settings)
+    before = _Table.read(csv, settings, part)
     if not overwrite:
         before.check_ours()
     counts = counted("columns", columns=settings, fit=fit_settings)
@@ -90,7 +96,9 @@ def columns_stage(
     return found
 
 
-def check_edited(csv: Path, settings: ColumnSettings, shape: tuple[int, ...]) -> None:
+def check_edited(
+    csv: Path, settings: ColumnSettings, shape: tuple[int, ...], part: Mapping[str, int] | None = None
+) -> None:
     """Check a table that was edited by hand, from which :func:`columns_stage` will start in images of ``shape`` (y, x).
 
     Raises
@@ -108,7 +116,7 @@ def check_edited(csv: Path, settings: ColumnSettings, shape: tuple[int, ...]) ->
             f"a link to {csv.readlink()}, which is not there" if csv.is_symlink() else "no file",
             "Bring it back, or move what is there away: then columns are found again",
         )
-    if _Table.read(csv, settings).is_edited:
+    if _Table.read(csv, settings, part).is_edited:
         check_inside(read_columns_csv(csv), shape, str(csv))
 
 
@@ -131,7 +139,8 @@ class _Table:
     given
         What the file holds that the settings name for method csv; empty for other methods.
     origin
-        What the settings take columns from. Another origin ends what was edited.
+        What the settings take columns from, and from where and in what places are counted. Another origin ends what was
+        edited.
     is_given
         Whether the settings name this very table.
     """
@@ -140,14 +149,14 @@ class _Table:
     content: bytes
     about: dict[str, Any]
     given: bytes
-    origin: dict[str, str]
+    origin: dict[str, Any]
     is_given: bool
 
     @classmethod
-    def read(cls, csv: Path, settings: ColumnSettings) -> _Table:
+    def read(cls, csv: Path, settings: ColumnSettings, part: Mapping[str, int] | None = None) -> _Table:
         by_file = settings.method == "csv" and settings.csv is not None
         given = content(settings.csv) if by_file else b""
-        origin = {"method": settings.method, "csv": _digest(given)}
+        origin = {"method": settings.method, "csv": _digest(given)} | _counted_in(part)
         about = metadata.attributes(csv.with_suffix(".zarr"))
         return cls(csv, content(csv), about, given, origin, by_file and Path(settings.csv or "").absolute() == csv)
 
@@ -215,6 +224,12 @@ def reopened(store: Path) -> xr.Dataset:
     found = datasets.open_dataset(store)
     del found.attrs[metadata.ATTRIBUTE]
     return found
+
+
+def _counted_in(part: Mapping[str, int] | None) -> dict[str, Any]:
+    """Return the pixel on disk from which places in a movie count, and their unit; nothing where it is the first, 1."""
+    pixels = [part[name] for name in ("top", "left", "bin_px")] if part else []
+    return {"pixels": pixels} if pixels not in ([], [0, 0, 1]) else {}
 
 
 def _digest(data: bytes) -> str:
