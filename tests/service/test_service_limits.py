@@ -5,7 +5,7 @@ import gc
 import json
 import os
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import httpx
@@ -15,14 +15,22 @@ from serviced import URL, make_app, make_root
 from starving import reserved
 
 from tract_dask.errors import SettingsError, SourceError
-from tract_dask.readers import READERS, Reader
+from tract_dask.readers import READERS, Reader, open_source
 from tract_dask.service.api.answers import whole
 from tract_dask.service.config import ServiceConfig
 from tract_dask.service.jobs import public
 from tract_dask.service.process_pool import ProcessPool
 from tract_dask.service.server import make_application
-from tract_dask.settings import ColumnSettings, FitSettings, SourceSettings, from_dict
+from tract_dask.settings import (
+    ColumnSettings,
+    ConvertSettings,
+    FitSettings,
+    MetadataSettings,
+    SourceSettings,
+    from_dict,
+)
 from tract_dask.stages.columns.sites import lattice_columns, settings_lattices
+from tract_dask.stages.convert.references import check_references
 from tract_dask.stages.drift.stage import read_drift_csv
 from tract_dask.store import columns as table_of_columns
 from tract_dask.store.columns import MOST_BYTES, parse_columns_csv, read_columns_csv
@@ -408,3 +416,11 @@ def test_nothing_holds_the_event_loop_up(root):
         assert asyncio.run(ask()) == []
     finally:
         app.state.services.pool.close()
+
+
+def test_a_list_of_faulty_pixels_that_would_take_minutes_is_no_list(tmp_path):
+    root = make_root(tmp_path / "data")
+    (root / "defects.csv").write_text("1,1\n" * (1 << 20) + "1,1\n")
+    with closing(open_source(root / "movie.npy")) as movie, pytest.raises(SourceError, match="give a mask") as error:
+        check_references(movie, ConvertSettings(defects=str(root / "defects.csv")), MetadataSettings())
+    assert error.value.where == str(root / "defects.csv")

@@ -96,6 +96,13 @@ def delete(client: TestClient, job: dict) -> dict:
     return answer.json()
 
 
+@pytest.mark.parametrize("output", ["movie.npy", "movie.npy/x", "movie.npy/x/y"])
+def test_a_file_is_no_folder_for_results(clients, output):
+    answer = clients["ana"].post("jobs", json={"source": "movie.npy", "output": output})
+    assert answer.status_code == 400, answer.text
+    assert answer.json()["error"]["where"] == output
+
+
 def test_a_folder_of_another_owner_is_refused(app, root, clients):
     _, folder = done(app, root, clients["ana"], output="here/ana")
     before = files(folder)

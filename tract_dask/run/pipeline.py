@@ -151,7 +151,7 @@ def run(
             if overwrite:
                 same = attempt(lambda: metadata.is_sound(outputs.movie) and is_movie_of(outputs.movie, opened))
                 attempt(partial(clear_run, outputs, on_event, keep_edited=same))
-            part = opened.metadata.part and dataclasses.asdict(opened.metadata.part)
+            part = dataclasses.asdict(opened.metadata.part) if opened.metadata.part else None
             attempt(partial(check_edited, outputs.columns, settings.columns, opened.shape[1:], part))
             return _run(opened, outputs, settings, client, on_event, report=report, until=until)
 

@@ -123,6 +123,9 @@ def check_owner(root: DataRoot, mark: Mark) -> None:
             raise _refused(
                 "this folder lies in the output of another run", mark.output, "a folder outside of it", str(around)
             )
+    for folder in (root.path / around for around in place.relative_to(root.path).parents):
+        if os.path.lexists(folder) and not folder.is_dir():
+            raise _refused("the output lies below a file", mark.output, "a folder", root.relative(folder))
     if not os.path.lexists(place):
         return
     if not place.is_dir():

@@ -23,7 +23,8 @@ from ...store.tables import decoded
 Image = NDArray[np.float64]
 
 _LISTS = (".csv", ".txt", ".tsv")
-_LIST_BYTES = 64 << 20
+_LIST_BYTES = 4 << 20
+"""Some hundred thousand pixels, which take a few seconds; more of them are a mask."""
 _BLOCK_BYTES = 64 << 20
 _MEANING = "Give one pixel in a line: x, y, counted from 0 in whole frames, as the file of the movie has them"
 
@@ -148,7 +149,10 @@ def _listed(path: Path, shape: tuple[int, ...], permit: Permit | None) -> NDArra
         text = decoded(read_small(path, _LIST_BYTES))
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(
-            "the list of pixels cannot be read", os.fspath(path), got=str(error), remedy=_MEANING
+            "the list of pixels cannot be read",
+            os.fspath(path),
+            got=str(error),
+            remedy=f"{_MEANING}; or give a mask, an image that is not 0 where a pixel is faulty",
         ) from error
     mask = np.zeros(shape, bool)
     names: tuple[str, ...] | None = None
