@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 _MISSING = 30.0
 """So many pixels would be higher by chance."""
 _RATIO, _RATIO_OF_BITS = 3.0, 1.0
-"""So many times as many pixels have the largest value as the next one; less is enough where it is 2^n - 1."""
+"""So many times as many pixels have the largest value as the next one; less is enough where it is 2^n - 1.
+
+Less is enough, too, among the highest values of pixels, of which noise makes a narrow peak: a single frame decides.
+"""
 _EXACT = 2.0**24
 _FADES, _LITTLE, _ALONE = 0.5, 1e-3, 0.02
 """It fades where this share of the pixels beside it have the next value, or this little of the range less, and hardly
@@ -42,21 +45,21 @@ def full_scale(usual_high: NDArray[np.float32], frame: NDArray[Any], used: NDArr
     255.0
     """
     known = usual_high[used & np.isfinite(usual_high)]
-    if not known.size or (top := float(known.max())) >= _EXACT or not _cut_off(known, top):
+    if not known.size or (top := float(known.max())) >= _EXACT or not _cut_off(known, top, _RATIO_OF_BITS):
         return None
     good = used & np.isfinite(frame)
-    return top if _cut_off(frame[good], top) and not _fades(frame, good, top) else None
+    ratio = _RATIO_OF_BITS if top >= 1 and np.log2(top + 1) % 1 == 0 else _RATIO
+    return top if _cut_off(frame[good], top, ratio) and not _fades(frame, good, top) else None
 
 
-def _cut_off(values: NDArray[Any], top: float) -> bool:
-    """Tell whether so many values are equal to ``top`` that some would be higher."""
+def _cut_off(values: NDArray[Any], top: float, ratio: float) -> bool:
+    """Tell whether so many values are equal to ``top``, against those next to it, that some would be higher."""
     reached = int(np.count_nonzero(values == top))
     below = values[values < top]
     if not reached or not below.size:
         return False
     beside = int(np.count_nonzero(below == below.max()))
-    of_bits = top >= 1 and np.log2(top + 1) % 1 == 0
-    return reached > (_RATIO_OF_BITS if of_bits else _RATIO) * beside and reached**2 > _MISSING * beside
+    return reached > ratio * beside and reached**2 > _MISSING * beside
 
 
 def _fades(frame: NDArray[Any], good: NDArray[np.bool_], top: float) -> bool:
