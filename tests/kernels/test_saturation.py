@@ -23,7 +23,8 @@ def counts(amplitude, background, n_frames=12):
 
 
 @pytest.mark.parametrize(
-    ("level", "offset", "cut_off"), [((60, 20), 0, 63), ((900, 300), -40, 760), ((5e4, 1e4), 0, 40_000), ((4, 2), 0, 3), ((60, 20), 0, 30)]
+    ("level", "offset", "cut_off"),
+    [((60, 20), 0, 63), ((900, 300), -40, 760), ((5e4, 1e4), 0, 40_000), ((4, 2), 0, 3), ((60, 20), 0, 30)],
 )
 def test_full_scale_is_where_pixels_are_cut_off(level, offset, cut_off):
     frames = np.minimum(counts(*level) + offset, cut_off)

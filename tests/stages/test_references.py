@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -12,13 +14,14 @@ from files_classic import mrc
 from files_dm import write_dm
 
 from tract_dask import convert, estimate_drift, fit_columns, open_movie, sum_image
-from tract_dask.errors import SettingsError, SourceError
+from tract_dask.errors import DestinationError, MissingSourceError, SettingsError, SourceError
 from tract_dask.readers import open_source
 from tract_dask.run.inspect import describe
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, SourceSettings
 from tract_dask.stages.convert.defects import finder_for
-from tract_dask.stages.convert.origin import movie_key
+from tract_dask.stages.convert.origin import is_converted, movie_key, remembered_source
 from tract_dask.stages.convert.references import check_references, read_references
+from tract_dask.stages.convert.stage import remake
 from tract_dask.store.schema import REJECTED
 
 LAYOUT = {"tile_px": 32, "shard_mb": 1}
@@ -237,6 +240,30 @@ def test_references_that_make_frames_worse_are_refused(camera, tmp_path, named, 
     settings = ConvertSettings(**LAYOUT, **{name: camera.path(file) for name, file in named.items()})
     with pytest.raises(SourceError, match=words):
         finder_for(open_source(source), tmp_path, settings)
+
+
+def test_what_references_a_movie_was_made_with_is_told(camera, tmp_path):
+    frames, dark, other = (tmp_path / name for name in ("movie.npy", "dark.npy", "other.npy"))
+    np.save(frames, camera.frames[:3])
+    np.save(dark, camera.dark)
+    np.save(other, camera.dark - 1)
+    made, settings = tmp_path / "movie.zarr", ConvertSettings(**LAYOUT, dark=str(dark), find_defects=False)
+    told = []
+    convert(frames, made, settings=settings, on_event=told.append)
+    assert told[-1].summary.endswith("corrected by --dark")
+    with pytest.raises(DestinationError, match=r"got convert\.dark holds something else than before\."):
+        convert(frames, made, settings=replace(settings, dark=str(other)))
+    with pytest.raises(DestinationError, match=r"got convert\.dark was given, and is not now\."):
+        convert(frames, made, settings=replace(settings, dark=None))
+    np.save(dark, camera.dark - 1)
+    with pytest.raises(SourceError, match=f"^{dark}: this is not what"):
+        remake(made, [0])
+    frames.unlink()
+    dark.unlink()
+    gone = remembered_source(made, str(frames), MissingSourceError("gone"))
+    assert is_converted(made, gone, settings, SourceSettings())
+    with pytest.raises(MissingSourceError, match="nowhere"):
+        is_converted(made, gone, replace(settings, dark="nowhere.npy"), SourceSettings())
 
 
 def test_references_in_the_formats_of_cameras(camera, tmp_path):

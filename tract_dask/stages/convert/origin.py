@@ -89,7 +89,8 @@ def counted_of(
 ) -> dict[str, Any]:
     """Return the settings of a movie's key that differ from their defaults, by their names in keys.
 
-    References count by what they hold. Where the source is gone, and they too, what is ``remembered`` of them does.
+    References count by what they hold. Where the source is gone, and they too, what the movie's attributes say of
+    them, ``remembered``, does.
     """
     known = remembered if isinstance(source, GoneSource) else None
     own = counted(STAGE, convert=settings, source=source_settings)
@@ -164,7 +165,7 @@ def _differences(
     """Return in words how a complete movie differs from what would be made; nothing where it does not."""
     made = present.get("made", {})
     then = made.get("settings", {})
-    now = counted_of(source, settings, source_settings, then)
+    now = counted_of(source, settings, source_settings, present)
     layout = plan_layout(source.shape, source.dtype, settings)
     laid = [layout.frames_per_shard, list(layout.chunk)] == [present.get("frames_per_shard"), present.get("chunk")]
     found = [] if made.get("content") == origin_of(source).content else ["the source has other content"]
@@ -172,7 +173,9 @@ def _differences(
         found.append(f"its conversion's number was {made.get('algorithm')}, and is {ALGORITHMS[STAGE]}")
     for name in sorted({*then, *now} - {*(_LAID_OUT if laid else ())}):
         old, new = (values.get(name, default_of(STAGE, name)) for values in (then, now))
-        if old != new:
+        if old != new and name.removeprefix("convert.") in references.NAMES:
+            found.append(references.difference_in_words(name, old, new))
+        elif old != new:
             found.append(f"{name} was {_in_words(old)}, and is {_in_words(new)}")
     return found
 

@@ -56,7 +56,7 @@ def content_of_reference(place: str, permit: Permit | None = None) -> tuple[str,
         return fingerprint(*image.files), image.inside
 
 
-def check_reference(place: str, movie: FrameSource) -> None:
+def check_reference(place: str, movie: FrameSource, *, may_be_list: bool = False) -> None:
     """Check that a reference is there and fits the frames of a movie; its pixels are not read.
 
     Raises
@@ -64,7 +64,7 @@ def check_reference(place: str, movie: FrameSource) -> None:
     SourceError
         As :func:`read_reference`; only lists are read.
     """
-    if is_list(place):
+    if may_be_list and is_list(place):
         _listed(Path(place), _whole(movie).shape[1:], movie.permit)
         return
     with closing(open_reference(place, permit=movie.permit)) as image:

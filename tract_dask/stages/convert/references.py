@@ -19,6 +19,7 @@ from ...readers.checks import Permit
 from ...readers.source import FrameSource
 from ...settings.declare import option
 from ...settings.run import ConvertSettings, MetadataSettings
+from ...settings.toml import from_toml
 from ...store.keys import digest_of
 from ...store.pixels import NO_PIXELS, Pixels
 from .reference_files import check_reference, content_of_reference, in_part, read_defects, read_reference
@@ -52,20 +53,48 @@ def contents(
 ) -> dict[str, str]:
     """Return what the references hold, by the names in keys; where one is gone, what is ``remembered`` of it.
 
+    Parameters
+    ----------
+    settings
+        Where they are.
+    remembered
+        What a movie's attributes say: it knows what references held whose files had these names.
+
     Raises
     ------
     SourceError
         Where one cannot be read.
     """
-    found = {}
+    found, known = {}, {}
+    if remembered:
+        made, then = remembered["made"]["settings"], from_toml(ConvertSettings, remembered["settings"], "")
+        known = {(name, _without_folder(place)): made.get(f"convert.{name}") for name, place in given(then).items()}
     for name, place in given(settings).items():
         try:
             found[f"convert.{name}"] = digest_of(*content_of_reference(place, permit))
         except MissingSourceError:
-            if not (remembered or {}).get(f"convert.{name}"):
+            if not (content := known.get((name, _without_folder(place)))):
                 raise
-            found[f"convert.{name}"] = str((remembered or {})[f"convert.{name}"])
+            found[f"convert.{name}"] = str(content)
     return found
+
+
+def _without_folder(place: str) -> tuple[str, str]:
+    outer, _, inner = place.partition("::")
+    return Path(outer).name, inner
+
+
+def difference_in_words(name: str, old: Any, new: Any) -> str:
+    """Return how a reference, by its name in keys, differs from the one before, by what both hold; None: not given.
+
+    Examples
+    --------
+    >>> difference_in_words("convert.dark", None, "5f2c")
+    'convert.dark was not given, and is now'
+    """
+    if old and new:
+        return f"{name} holds something else than before"
+    return f"{name} was {'given, and is not now' if old else 'not given, and is now'}"
 
 
 def check_references(movie: FrameSource, settings: ConvertSettings, metadata: MetadataSettings) -> None:
@@ -78,8 +107,8 @@ def check_references(movie: FrameSource, settings: ConvertSettings, metadata: Me
     SettingsError
         Where an offset is given beside a dark image, which holds it, or beside a gain reference without one.
     """
-    for place in given(settings).values() if movie.files else ():
-        check_reference(place, movie)
+    for name, place in given(settings).items() if movie.files else ():
+        check_reference(place, movie, may_be_list=name == "defects")
     if isinstance(metadata.offset, str) or metadata.offset == 0:
         return
     if settings.dark is not None or settings.gain_reference is not None:

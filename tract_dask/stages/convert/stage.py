@@ -59,7 +59,7 @@ from .origin import (
     origin_of,
     remembered,
 )
-from .references import applied_by, check_references, given, with_whole_paths
+from .references import applied_by, check_references, contents, given, with_whole_paths
 from .shard import Job, convert_shard
 
 
@@ -132,7 +132,10 @@ def convert(
         finalise(path, statistics, known, pixels)
         update_metadata(path, known, to_measure=_to_measure(metadata))
     journal.remove()
-    summary = ", ".join([f"{n_frames} frames in {len(shards)} shards", *in_words(pixels.counts((n_y, n_x)))])
+    corrected = [f"corrected by {' and '.join(options)}"] if (options := applied_by(settings)) else []
+    summary = ", ".join(
+        [f"{n_frames} frames in {len(shards)} shards", *corrected, *in_words(pixels.counts((n_y, n_x)))]
+    )
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=summary))
     return path
 
@@ -242,9 +245,17 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     declared = from_toml(SourceSettings, about["source_settings"], str(path))
     source = open_source(about.get("source_files") or about["source"], declared)
     if movie_key(source, settings, declared) != about["key"]:
+        made = about["made"]
+        other = [] if made["content"] == content_of(source) else [source.path]
+        now = contents(settings)
+        other += [
+            place
+            for name, place in given(settings).items()
+            if now[key := f"convert.{name}"] != made["settings"].get(key)
+        ]
         raise SourceError(
-            "the source is not what the movie was made from",
-            source.path,
+            "this is not what the movie was made from",
+            ", ".join(other) or source.path,
             "the same file",
             "another one",
             f"Remove {path}, and convert what you have",
