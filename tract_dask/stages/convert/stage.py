@@ -133,10 +133,8 @@ def convert(
         update_metadata(path, known, to_measure=_to_measure(metadata))
     journal.remove()
     corrected = [f"corrected by {' and '.join(options)}"] if (options := applied_by(settings)) else []
-    summary = ", ".join(
-        [f"{n_frames} frames in {len(shards)} shards", *corrected, *in_words(pixels.counts((n_y, n_x)))]
-    )
-    on_event(StageDone(STAGE, time.perf_counter() - started, summary=summary))
+    words = [f"{n_frames} frames in {len(shards)} shards", *corrected, *in_words(pixels.counts((n_y, n_x)))]
+    on_event(StageDone(STAGE, time.perf_counter() - started, summary=", ".join(words)))
     return path
 
 
@@ -244,22 +242,7 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
     settings = from_toml(ConvertSettings, about["settings"], str(path))
     declared = from_toml(SourceSettings, about["source_settings"], str(path))
     source = open_source(about.get("source_files") or about["source"], declared)
-    if movie_key(source, settings, declared) != about["key"]:
-        made = about["made"]
-        other = [] if made["content"] == content_of(source) else [source.path]
-        now = contents(settings)
-        other += [
-            place
-            for name, place in given(settings).items()
-            if now[key := f"convert.{name}"] != made["settings"].get(key)
-        ]
-        raise SourceError(
-            "this is not what the movie was made from",
-            ", ".join(other) or source.path,
-            "the same file",
-            "another one",
-            f"Remove {path}, and convert what you have",
-        )
+    _check_key(path, source, settings, declared, about)
     layout = plan_layout(source.shape, source.dtype, settings)
     chosen = [shard for shard in split(layout.shape[0], layout.frames_per_shard) if everything or shard.index in shards]
     frame_bytes = math.prod(layout.shape[1:]) * layout.dtype.itemsize
@@ -285,6 +268,31 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
             datasets.overwrite_array(path / frame_array(name), source.metadata.along_frames[name].values)
         finalise(path, statistics, SourceMetadata(**_said(about)), gathered.pixels(finder))
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
+
+
+def _check_key(
+    path: Path, source: FrameSource, settings: ConvertSettings, declared: SourceSettings, about: Mapping[str, Any]
+) -> None:
+    """Check that the movie at ``path``, which says this ``about`` itself, was made from this source and its references.
+
+    Raises
+    ------
+    SourceError
+        Naming what is another.
+    """
+    if movie_key(source, settings, declared) == about["key"]:
+        return
+    made, now = about["made"], contents(settings)
+    other = [] if made["content"] == content_of(source) else [source.path]
+    for name, place in given(settings).items():
+        other += [place] if now[f"convert.{name}"] != made["settings"].get(f"convert.{name}") else []
+    raise SourceError(
+        "this is not what the movie was made from",
+        ", ".join(other) or source.path,
+        "the same file",
+        "another one",
+        f"Remove {path}, and convert what you have",
+    )
 
 
 def _goes_on(path: Path, key: str, stamps: Stamps, on_event: Sink) -> bool:
