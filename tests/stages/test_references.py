@@ -251,7 +251,7 @@ def test_what_references_a_movie_was_made_with_is_told(camera, tmp_path):
     told = []
     convert(frames, made, settings=settings, on_event=told.append)
     assert told[-1].summary.endswith("corrected by --dark")
-    with pytest.raises(DestinationError, match=r"got convert\.dark holds something else than before\."):
+    with pytest.raises(DestinationError, match=r"got convert\.dark has other contents than before\."):
         convert(frames, made, settings=replace(settings, dark=str(other)))
     with pytest.raises(DestinationError, match=r"got convert\.dark was given, and is not now\."):
         convert(frames, made, settings=replace(settings, dark=None))

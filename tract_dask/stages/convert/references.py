@@ -93,7 +93,7 @@ def difference_in_words(name: str, old: Any, new: Any) -> str:
     'convert.dark was not given, and is now'
     """
     if old and new:
-        return f"{name} holds something else than before"
+        return f"{name} has other contents than before"
     return f"{name} was {'given, and is not now' if old else 'not given, and is now'}"
 
 
