@@ -170,6 +170,17 @@ def test_what_does_not_change_shows_no_event(strength):
     assert len(np.unique(events.column_id)) <= 400 * (0.05 + 3 * np.sqrt(0.05 * 0.95 / 400))
 
 
+@pytest.mark.parametrize("n_frames", [20, 40])
+@pytest.mark.parametrize("confidence", [0.95, 0.99])
+def test_a_column_that_is_never_there_has_the_stated_chance(n_frames, confidence):
+    """At most 5 % or 1 % of 600 (to 3 standard errors) are seen in any frame; weak ones of strength 1.5 in all."""
+    noise = np.random.default_rng(n_frames).normal(size=(n_frames, 600))
+    rate = 1 - confidence
+    seen = states(tracks_of(noise), confidence).any("frame")
+    assert float(seen.mean()) <= rate + 3 * np.sqrt(rate * confidence / 600)
+    assert float(states(tracks_of(noise + 1.5), confidence).mean()) > 0.97
+
+
 def test_appearances_are_found_where_they_are():
     """Columns of strength 4 that vanish for 8 frames, appear late, or are there for 6 frames: all, to a frame."""
     truth = np.ones((60, 90), bool)

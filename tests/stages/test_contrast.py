@@ -58,6 +58,11 @@ def test_the_rim_of_the_specimen_does_not_decide(contrast, vacuum):
     assert judged(found) == (1.0, 0)
 
 
+@pytest.mark.parametrize("vacuum", [1.2, 1.5])
+def test_a_rim_lower_than_columns_is_no_column(vacuum):
+    assert judged(find_columns(summed(0.9, vacuum))) == (1.0, 0)
+
+
 def test_a_wedge_does_not_decide():
     assert find_columns(summed(-0.3, slope=2.0)).attrs["contrast"] == "dark"
 

@@ -253,7 +253,8 @@ def states(tracks: xr.Dataset, confidence: float = 0.95) -> xr.DataArray:
     """Return in which frames each column is there by the test of :func:`appearances`, (frame, column_id).
 
     It judges a frame with the help of those around it, and so sees weaker columns than :func:`present`, but no absence
-    of a few frames. False where nothing is known: :func:`looked` tells where.
+    of a few frames. False where nothing is known: :func:`looked` tells where. A column that is never there is there in
+    any frame with probability 1 - ``confidence`` at most.
     """
     path = xr.zeros_like(tracks["presence"], dtype=np.bool_).compute()
     for column, known, there, _ in _state_paths(tracks, confidence):
@@ -298,7 +299,10 @@ def _two_states(strength: Floats, alpha: float) -> tuple[NDArray[np.bool_], Floa
         merit = float(scores[there].sum() - cost * np.count_nonzero(np.diff(there)))
         if merit > best[0]:
             best = merit, there, scores
-    return best[1:]
+    _, there, scores = best
+    if there.all() and stats.norm.sf(strength.sum() / np.sqrt(n * variance)) > alpha / 2:
+        return np.zeros(n, np.bool_), np.zeros(n)  # no switch has a cost here, so the mean itself must speak for it
+    return there, scores
 
 
 def _events(there: NDArray[np.bool_], scores: Floats) -> list[tuple[int, float]]:

@@ -21,8 +21,9 @@ _PX_PER_SPACING = 24
 """Pixels on which the distance between columns is seen: peaks are looked for in an image binned so far."""
 _BINS_PER_SPACING = 8
 """Whether there are ridges is seen on so many."""
-_OF_COLUMNS, _HIGH, _SURE = 0.98, 0.5, 4.0
-"""Quantile of the heights that columns have; ridges matter from half of it on, and from four times the noise."""
+_OF_COLUMNS, _HIGH, _SURE = 0.98, 0.15, 4.0
+"""Quantile of the heights that columns have; ridges matter from this share of it on (a lattice of columns alone has up
+to 0.1), and from four times the noise."""
 _COARSE = 16
 """Smoothing by so many px or more is done on bins of a sixteenth of it."""
 _SAMPLE = 1 << 20
@@ -64,7 +65,7 @@ def relief(
 
     Binned to 24 px a spacing, but to no more than ``precision_px``; blurred to 0.08 of the spacing (a column is about
     twice as wide), or ``blur_sigma_px`` where that is more; less the surroundings over a third of it. Where edges of
-    the surroundings, as the rim of the specimen, leave ridges that are half as high as columns, these go as well.
+    the surroundings, as the rim of the specimen, leave ridges of 0.15 of the columns' height, these go as well.
     """
     step = max(1, int(min(spacing / _PX_PER_SPACING, precision_px)))
     sigma = max(blur_sigma_px or 0.0, 0.08 * spacing) / step
@@ -94,7 +95,7 @@ def _has_ridges(image: Reals, height: Reals, noise: float, spacing: float) -> bo
         return False
     ridges = _ridges(binned(image, bins).astype(np.float32), spacing / bins)
     columns = np.quantile(sample((binned(height, bins) - ridges).ravel()), _OF_COLUMNS)
-    return bool(np.abs(ridges).max() > max(_HIGH * columns, _SURE * noise))
+    return bool(ridges.max() > max(_HIGH * columns, _SURE * noise))
 
 
 def binned(image: Reals | Mask, step: int) -> Places:
