@@ -106,6 +106,14 @@ def test_read_noise_is_told_from_an_offset_where_counts_are_few():
     assert camera.read_noise == pytest.approx(6, rel=0.15)
 
 
+def test_wide_columns_that_move_by_themselves_share_no_noise():
+    """Half a pixel of jitter: 0.3 % of correlation over the whole width of the columns was a fifth of the noise."""
+    counts, drift, _ = frames_of(electrons=8.0, contrast=3.0, sigma=5.0, moving=0.5)
+    camera = measured(counts, drift)
+    assert camera.shared.shape == (1, 1)
+    assert camera.per_electron == pytest.approx(1, abs=0.05)
+
+
 @pytest.mark.parametrize(("moving", "share"), [(0.25, 0.1), (0.5, 0.25)])
 def test_columns_that_move_are_neither_gain_nor_shared_noise(moving, share):
     """A quarter and half a pixel of jitter of every column; at 100 electrons half a pixel is as much as the noise."""
