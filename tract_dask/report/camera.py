@@ -16,8 +16,8 @@ PATTERN = 0.02
 """A fixed pattern with a larger standard deviation, as a share of the level, is worth a warning."""
 FAINT = 0.03
 """Square of the relative error of a single frame's intensity from which a warning is worth it."""
-_SURE = 4.0
-"""Standard errors by which it must be off as well."""
+_SURE = 5.0
+"""Standard errors by which it must be off as well; columns that move by themselves leave more than one."""
 _READ_SHARE = 0.5
 """An offset that would leave more than this share of the noise to the read noise is doubted."""
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ..kernels.noise import Cells, Lags, Law, correlation, fit_law, gather, lag_sums
 from ..kernels.patterns import Measured, pattern_power
@@ -108,7 +109,20 @@ def _measured(movie: Movie, mean: Floats, covered: Bools, drift: Floats, used: B
     several = np.average(levels**2, weights=every.number) > 4 * chance_level
     law = fit_law(every) if several else None
     shared, chance = _shared(fields, law)
+    if law and shared is not None and shared.size > 1:
+        every = Cells.joined([gather(_as_noise_sees(f, shared), *f[1:]) for f in fields])
+        law = fit_law(every)
     return _camera(every, law, shared, chance, movie.offset)
+
+
+def _as_noise_sees(field: _Field, shared: Floats) -> Image:
+    """Return the frames of a field at the level of which their noise is, where pixels share electrons.
+
+    A detector that spreads electrons by weights w has the mean of its pixels blurred by w, but their variance by w
+    squared: for a Gaussian of variance v that is half as wide. The sum of the noise's autocorrelation is 4 pi v.
+    """
+    variance = float(shared.sum()) / (4 * np.pi)
+    return np.asarray(field.frames - np.float32(variance / 4) * ndimage.laplace(field.level), np.float32)
 
 
 def _camera(cells: Cells, law: Law | None, shared: Floats | None, chance: float, offset_said: float) -> Camera:
