@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import h5py
@@ -17,6 +18,7 @@ from tract_dask import convert, estimate_drift, fit_columns, open_movie, sum_ima
 from tract_dask.errors import DestinationError, MissingSourceError, SettingsError, SourceError
 from tract_dask.readers import open_source
 from tract_dask.run.inspect import describe
+from tract_dask.run.verify import repair, verify
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, SourceSettings
 from tract_dask.stages.convert.defects import finder_for
 from tract_dask.stages.convert.origin import is_converted, movie_key, remembered_source
@@ -150,6 +152,17 @@ def test_the_key_follows_what_references_hold(camera, tmp_path):
     assert movie_key(source, same) == key
     np.save(copy, np.zeros(camera.scene.shape))
     assert movie_key(source, same) != key
+
+
+def test_damaged_shards_and_masks_are_made_again_with_the_references(movie, tmp_path):
+    copy = shutil.copytree(movie.path, tmp_path / "copy.zarr")
+    names = ["0/c.1.0.0", "binned/4/c.0.0.0", "pixels/mask/c.0.0"]
+    for name in names:
+        (copy / name).unlink()
+    repair(verify(copy))
+    assert verify(copy).sound
+    for name in names:
+        assert (copy / name).read_bytes() == (movie.path / name).read_bytes()
 
 
 def test_a_part_is_corrected_by_the_references_of_whole_frames(camera, movie, tmp_path):
