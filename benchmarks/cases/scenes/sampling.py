@@ -29,7 +29,7 @@ ELECTRONS = 12_000.0
 """Height of a column times the spacing squared, counts px^2; the background is a third of the height."""
 HEADINGS = (
     *("spacing, px", "sigma, px", "window, px", "blur, px", "fit", "fits", "lost columns", "accepted"),
-    *("sd / bound", "pull of x, y", "intensity", "its pull"),
+    *("sd / bound", "pull of x, y", "intensity", "its pull within a column", "scatter of columns / error"),
 )
 WAYS: dict[str, dict[str, Any]] = {"lsq": {}, "lsq, free": {"shape": "free"}, "poisson": {"estimator": "poisson"}}
 
@@ -60,12 +60,13 @@ def row(name: str, tracks: xr.Dataset, scene: Scene, judged: NDArray[np.int64], 
     errors = (found[:, which] - truth)[good]
     pulls = errors / tracks["stderr"].sel(parameter=["x", "y"]).to_numpy()[:, which][good]
     volume = INTENSITY_SCALE["paper"] * 2 * np.pi * scene.amplitudes[0, 0] * scene.sigma**2
-    intensity = tracks["intensity"].to_numpy()[:, which][good] / volume
-    stated = tracks["intensity_stderr"].to_numpy()[:, which][good] / volume
-    off = (intensity - intensity.mean()) / np.sqrt(np.mean(stated**2))
+    intensity = np.where(good, tracks["intensity"].to_numpy()[:, which] / volume, np.nan)
+    stated = np.where(good, tracks["intensity_stderr"].to_numpy()[:, which] / volume, np.nan)
+    of_columns, usual = np.nanmean(intensity, axis=0), np.sqrt(np.nanmean(stated**2))
     return (
         f"| {name} | {good.size} | {lost} | {good.mean():.1%} | {errors.std() / bound_px:.3f}"
-        f" | {np.sqrt((pulls**2).mean()):.2f} | {intensity.mean():.3f} | {off.std():.2f} |"
+        f" | {np.sqrt((pulls**2).mean()):.2f} | {np.nanmean(intensity):.3f}"
+        f" | {np.nanstd(intensity - of_columns) / usual:.2f} | {of_columns.std() / usual:.2f} |"
     )
 
 
