@@ -118,12 +118,12 @@ def cut_windows(
     frames: Array | Tiles,
     corner_y: npt.ArrayLike,
     corner_x: npt.ArrayLike,
-    size: int,
+    size: int | tuple[int, int],
     sigma: float,
     gain: float = 1.0,
     first: int = 0,
 ) -> npt.NDArray[np.float32]:
-    """Return square windows of the frames, each equal bit for bit to the same window of ``blur(gain * frame, sigma)``.
+    """Return windows of the frames, each equal bit for bit to the same window of ``blur(gain * frame, sigma)``.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def cut_windows(
     corner_y, corner_x
         (f, n) integers: the first row and column of every window.
     size
-        Side of the windows in px.
+        Side of the windows in px, or rows and columns.
     sigma
         Of the blur, in px; 0 for none.
     first
@@ -141,7 +141,7 @@ def cut_windows(
 
     Returns
     -------
-    (f, n, size, size) float32. A window that lies partly outside the frame is all zeros: test the corners to know it.
+    (f, n, rows, columns) float32. A window that lies partly outside the frame is all zeros: test the corners for that.
 
     Raises
     ------
@@ -153,9 +153,10 @@ def cut_windows(
     if corners_y.ndim != 2 or corners_y.shape != corners_x.shape or first + len(corners_y) > tiles.pixels.shape[1]:
         most = tiles.pixels.shape[1] - first
         raise ValueError(f"corners must be (f, n), f up to {most}, got {corners_y.shape} and {corners_x.shape}")
-    shape = (*corners_y.shape, size, size)
+    sides = (size, size) if isinstance(size, int) else size
+    shape = (*corners_y.shape, *sides)
     out = _room_for(math.prod(shape))
-    if not _write_windows(tiles, first, corners_y, corners_x, (size, size), sigma, gain, out):
+    if not _write_windows(tiles, first, corners_y, corners_x, sides, sigma, gain, out):
         raise ValueError("a window reaches into a tile that is missing")
     return out[: math.prod(shape)].reshape(shape)
 

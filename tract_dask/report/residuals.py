@@ -92,7 +92,8 @@ def residual_windows(tracks: xr.Dataset, summed: xr.Dataset, which: Iterable[int
     ------
     numpy.ndarray
         (3, window, window): blurred image, model, and their difference, in counts a frame, NaN beyond the disc, and
-        everywhere where the column was not fitted in the summed image.
+        everywhere where the column was not fitted in the summed image. The model of touching columns is that of all in
+        the group.
     """
     window, sigma = int(tracks.attrs["window_px"]), float(tracks.attrs["reference_blur_px"])
     image = blur(summed["image"].to_numpy(), sigma)
@@ -101,11 +102,16 @@ def residual_windows(tracks: xr.Dataset, summed: xr.Dataset, which: Iterable[int
     half = window // 2
     rows, columns = np.mgrid[-half : half + 1, -half : half + 1]
     disc = rows**2 + columns**2 <= half**2
-    for own in parameters[list(which)]:
+    groups = tracks["group"].to_numpy() if "group" in tracks else np.zeros(len(parameters), np.int64)
+    for number in which:
+        own = parameters[number]
         y, x = (round(own[Y]), round(own[X])) if np.isfinite(own).all() else (-1, -1)
         if min(y, x) < half or y + half >= image.shape[0] or x + half >= image.shape[1]:
             yield np.full((3, window, window), np.nan)
             continue
         data = image[y - half : y + half + 1, x - half : x + half + 1]
         model = evaluate(own, columns + x, rows + y)
+        for other in np.flatnonzero((groups == groups[number]) & (groups > 0)):
+            if other != number:
+                model += evaluate(parameters[other], columns + x, rows + y) - parameters[other, BACKGROUND]
         yield np.where(disc, np.stack([data, model, data - model]), np.nan)

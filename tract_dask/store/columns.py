@@ -37,6 +37,7 @@ def column_dataset(
     column_id: ArrayLike | None = None,
     fit: ArrayLike | None = None,
     status: ArrayLike | None = None,
+    group: ArrayLike | None = None,
 ) -> xr.Dataset:
     """Return a Dataset of columns as declared in :data:`schema.COLUMNS`.
 
@@ -50,6 +51,8 @@ def column_dataset(
         From 1 on, where it is not given.
     fit, status
         (columns, 7) fit on the summed image, NaN where there is none, and (columns,) its flags.
+    group
+        (columns,) touching columns that are fitted together; 0, which is the default: alone.
     """
     xy = np.asarray(places, dtype=np.float64).reshape(-1, 2)
     kinds = [kind] * len(xy) if isinstance(kind, str) else list(kind)
@@ -68,6 +71,8 @@ def column_dataset(
         {"column_id": ids.astype(np.int64), "parameter": list(parameters.PARAMETERS)},
     )
     dataset["status_ref"].attrs |= schema.STATUS_ATTRIBUTES
+    numbers = np.zeros(len(xy), np.int64) if group is None else np.asarray(group, np.int64)
+    dataset["group"] = schema.GROUP.dims, numbers, schema.GROUP.attributes
     return dataset.assign_coords(unit=("parameter", list(parameters.PARAMETER_UNITS)))
 
 

@@ -88,6 +88,8 @@ def create(
     static = columns.assign_coords(schema.coordinates(len(time)) | dict(frame_values or {}))
     static = static.assign({name: (schema.RESULTS[name].dims, values) for name, values in known.items()})
     static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
+    numbers = static.get(schema.GROUP.name, xr.DataArray(np.zeros(sizes["column_id"], np.int64), dims="column_id"))
+    static[schema.GROUP.name] = schema.GROUP.dims, numbers.to_numpy(), schema.GROUP.attributes
     for name in (*known, *schema.COLUMNS):
         static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
     static.attrs = {name: about.get(name) for name in _SCALES}
@@ -253,7 +255,8 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
         )
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
-    dataset = stored[[*schema.RESULTS, *schema.COLUMNS]].chunk(frame=frames)
+    grouped = [schema.GROUP.name] if schema.GROUP.name in stored else []  # earlier versions have none
+    dataset = stored[[*schema.RESULTS, *schema.COLUMNS, *grouped]].chunk(frame=frames)
     if not about.get("complete"):
         dataset = _grown(dataset, path)
     dataset.attrs |= {name: about.get(name) for name in _SCALES}

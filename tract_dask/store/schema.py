@@ -153,6 +153,9 @@ COLUMNS = _declare(
 )
 """The columns as found in the summed image; also part of results.zarr."""
 
+GROUP = Variable("group", ("column_id",), "int64", "1", "Touching columns that are fitted together; 0: alone", 0)
+"""A variable that columns may have; without it all are alone."""
+
 DRIFT = _declare(
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
     Variable(

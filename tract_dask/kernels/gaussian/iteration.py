@@ -93,15 +93,15 @@ parameters were not free in it, a bit each."""
 
 RUNNING, CONVERGED, ITERATION_LIMIT, NO_INFORMATION, NOT_FINITE = -1, 0, 2, 3, 4
 
-_GAUSS_NEWTON_STEPS = 2.0  # from further away the second derivatives mislead
+GAUSS_NEWTON_STEPS = 2.0  # from further away the second derivatives mislead
 FIRST_DAMPING = 1e-2
-_UNDAMPED = 1e-2  # below this a step is a Gauss-Newton step for all that matters
-_LARGEST_DAMPING = 1e8
-_LEFT = 0.1  # of the tolerance, what may be left to go after a step whose length is not below it
-_SETTLED = 1e-4  # of a raw pixel's variance: what the residual's sum of squares may still fall by
-_STALLED = 1e-2  # the same after a step that float32 saw as no fall
-_ROUNDING = 1e-5  # relative noise of a sum of squares in float32
-_FLOOR = 1e-6  # the same, relative to the pixels' own sum of squares
+UNDAMPED = 1e-2  # below this a step is a Gauss-Newton step for all that matters
+LARGEST_DAMPING = 1e8
+LEFT = 0.1  # of the tolerance, what may be left to go after a step whose length is not below it
+SETTLED = 1e-4  # of a raw pixel's variance: what the residual's sum of squares may still fall by
+STALLED = 1e-2  # the same after a step that float32 saw as no fall
+ROUNDING = 1e-5  # relative noise of a sum of squares in float32
+FLOOR = 1e-6  # the same, relative to the pixels' own sum of squares
 _LARGEST = 3e38
 _LEAST_RANGE = 1e-35  # below this float32 runs out of digits
 _FEW = LANES // 4
@@ -244,10 +244,10 @@ def _gain(state: Rows, sums: list[Vector]) -> Vector:
 @traced()
 def _accept(state: Rows, rows: Rows, n_pixels: Vector, likelihood: Any) -> None:
     """Take over the trial, with its sums, where it is no worse than the point."""
-    sums, floor = read(rows, 0, N_SUMS), _FLOOR * state[PIXELS + 1]
+    sums, floor = read(rows, 0, N_SUMS), FLOOR * state[PIXELS + 1]
     if likelihood is None:
         _project(state, sums, n_pixels)
-        better = sums[MERIT] <= state[SUMS + MERIT] * (1 + _ROUNDING) + floor
+        better = sums[MERIT] <= state[SUMS + MERIT] * (1 + ROUNDING) + floor
     else:
         better = _gain(state, sums) >= -floor
     accepted = state[OUTCOME].equals(RUNNING) & better
@@ -257,7 +257,7 @@ def _accept(state: Rows, rows: Rows, n_pixels: Vector, likelihood: Any) -> None:
         state[SUMS + row] = select(accepted, sums[row], state[SUMS + row])
     state[LENGTH] = select(accepted, state[LENGTH], 0)
     damping = state[DAMPING]
-    state[DAMPING] = select(accepted, 0.1 * damping, larger(10 * damping, _UNDAMPED))
+    state[DAMPING] = select(accepted, 0.1 * damping, larger(10 * damping, UNDAMPED))
 
 
 @traced(types.int64)
@@ -273,7 +273,7 @@ def _set_up(state: Rows, system: Rows, again: Any) -> Any:
     hessian[shape], newton[shape] = hessian[shape] + by_turn, newton[shape] + by_turn
     for first, values in ((HESSIAN, hessian), (NEWTON, newton), (GRADIENT, gradient), (LOW, low), (HIGH, high)):
         write(system, first, values)
-    system[USE_NEWTON] = select(state[STEPS] >= _GAUSS_NEWTON_STEPS, free.of(1), 0)
+    system[USE_NEWTON] = select(state[STEPS] >= GAUSS_NEWTON_STEPS, free.of(1), 0)
     release(system, free >= 0)
     u, v = point[CURVATURE_U], point[CURVATURE_V]
     stuck = state[OUTCOME].equals(RUNNING) & u.equals(v) & (high[4] <= 0) & (free > 0) & (spread(again) <= 0)
@@ -323,14 +323,14 @@ def _conclude(state: Rows, system: Rows, limits: Any, likelihood: Any) -> Any:
     trial = move(point, step, state + BOUNDS, state[SHAPE_FREE])
     length, before, held = length_px(point, step), state[LENGTH], _held(system)
     shrinking = (
-        (length < 0.5 * before) & (length * length < _LEFT * tolerance * (before - length)) & held.equals(state[HELD])
+        (length < 0.5 * before) & (length * length < LEFT * tolerance * (before - length)) & held.equals(state[HELD])
     )
     slope, noise = _slope(system, step), state[SUMS + MERIT] * share
-    settled = -slope < select(before > 0, noise * _SETTLED, noise * _STALLED)  # a length of 0: the last was rejected
+    settled = -slope < select(before > 0, noise * SETTLED, noise * STALLED)  # a length of 0: the last was rejected
     near = (length < tolerance) | shrinking | settled
-    small = near & (damping <= _UNDAMPED) & solved
+    small = near & (damping <= UNDAMPED) & solved
     known = (system[HESSIAN + XX] > 0) & (system[HESSIAN + YY] > 0)
-    stopped = (damping > _LARGEST_DAMPING) | (steps >= most)
+    stopped = (damping > LARGEST_DAMPING) | (steps >= most)
     none = damping.of(0)
     outcome = select(stopped, select(solved, none + ITERATION_LIMIT, NO_INFORMATION), RUNNING)
     outcome = select(small, select(known, none + CONVERGED, NO_INFORMATION), outcome)

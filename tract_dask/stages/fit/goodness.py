@@ -10,7 +10,7 @@ added.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ _OF_MEDIAN = np.pi / 2
 
 
 class Freedom(NamedTuple):
-    """Degrees of freedom of a window's residual.
+    """Degrees of freedom of a window's residual: numbers, or arrays of the columns'.
 
     Attributes
     ----------
@@ -47,12 +47,12 @@ class Freedom(NamedTuple):
         of a sum of squares, times the electrons in a pixel.
     """
 
-    degrees: float
-    skew_degrees: float
-    grain: float
+    degrees: Any
+    skew_degrees: Any
+    grain: Any
 
     @property
-    def median(self) -> float:
+    def median(self) -> Any:
         """Median of the residual's sum of squares, in units of its mean (Wilson and Hilferty, 1931)."""
         k = max(self.skew_degrees, 0.5)
         return 1 + k * ((1 - 2 / (9 * k)) ** 3 - 1) / math.sqrt(max(self.degrees, 0.5) * k)
@@ -70,16 +70,29 @@ def freedom(column: Floats, size: int, settings: FitSettings, shared: Floats | N
     shared
         (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; None: they share none.
     """
-    likelihood = settings.estimator == "poisson"
     rows, across = np.indices((size, size), dtype=np.float64)
-    disc = (np.hypot(rows - size // 2, across - size // 2) <= size / 2).ravel()
+    disc = np.hypot(rows - size // 2, across - size // 2) <= size / 2
     at = column.copy()
     at[[X, Y]] = size // 2
     expected, slopes, _ = model_slopes(at, across.ravel(), rows.ravel(), fixed_shape=settings.shape == "fixed")
+    return freedom_left(slopes, expected, disc, settings, shared)
+
+
+def freedom_left(
+    slopes: Floats, expected: Floats, mask: NDArray[np.bool_], settings: FitSettings, shared: Floats | None = None
+) -> Freedom:
+    """Return the degrees of freedom that a model leaves, given its slopes (n, pixels) and expected counts (pixels,).
+
+    Parameters
+    ----------
+    mask
+        (rows, columns) pixels that count.
+    """
+    likelihood, disc = settings.estimator == "poisson", mask.ravel()
     variance = np.maximum(expected, _LEAST * np.abs(expected).max()) if settings.counting or likelihood else disc * 1.0
     slopes = disc * slopes / (np.sqrt(variance) if likelihood else 1.0)
-    basis = np.linalg.qr((slopes / np.sqrt((slopes**2).sum(axis=1))[:, None]).T)[0].T.reshape(-1, size, size)
-    weight = (disc if likelihood else disc * np.sqrt(variance / variance.mean())).reshape(size, size).astype(np.float64)
+    basis = np.linalg.qr((slopes / np.sqrt((slopes**2).sum(axis=1))[:, None]).T)[0].T.reshape(-1, *mask.shape)
+    weight = (disc if likelihood else disc * np.sqrt(variance / variance.mean())).reshape(mask.shape).astype(np.float64)
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
     lags = np.convolve(kernel, kernel)
     common = np.outer(lags, lags)

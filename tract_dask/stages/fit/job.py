@@ -29,6 +29,8 @@ from ...store.provenance import provenance
 from ...store.strangers import MOVIE_KEY
 from ..columns.window_size import neighbour_distance, resolve_blur, resolve_window
 from ..pixel_range import check_pixels
+from .goodness import Freedom
+from .groups import Groups, plan_groups
 from .noise_size import WindowNoise, window_noise
 from .vacuum import check_box, find_vacuum, why_unusable
 
@@ -106,7 +108,7 @@ class Job:
     @lru_cache(maxsize=4)
     def load(cls, path: Path, movie: Movie, key: str) -> Job:
         """Return the job that :meth:`save` has written to ``path``; ``key`` tells one fit stage from the next."""
-        columns = datasets.open_dataset(path, only=(*schema.COLUMNS, "drift_measured"))
+        columns = datasets.open_dataset(path, only=(*schema.COLUMNS, schema.GROUP.name, "drift_measured"))
         about = metadata.attributes(path)
         if about.get("key") != key:
             raise left_over(path, f"key {key}", f"key {about.get('key')}")
@@ -188,7 +190,43 @@ class Job:
     def window_noise(self) -> WindowNoise:
         """What each column's window does with noise."""
         shared = None if self.correlation is None else np.array(self.correlation)
-        return window_noise(self.reference, self.window_px, self.settings, shared)
+        noise = window_noise(self.reference, self.window_px, self.settings, shared)
+        for groups in self.groups:
+            noise.left[groups.members], noise.level[groups.members] = groups.left[:, None], groups.level[:, None]
+        return noise
+
+    @cached_property
+    def counted(self) -> NDArray[np.bool_]:
+        """(columns,) whose windows tell how large the noise is: one of each group."""
+        counted = np.ones(len(self.reference), np.bool_)
+        for groups in self.groups:
+            counted[groups.members[:, 1:]] = False
+        return counted
+
+    @cached_property
+    def freedom(self) -> Freedom:
+        """Degrees of freedom of each column's residual: one number for all, or (columns,) where there are groups."""
+        alone = self.window_noise.free
+        if not self.groups:
+            return alone
+        values = np.tile(np.array(alone), (len(self.reference), 1))
+        for groups in self.groups:
+            values[groups.members] = groups.free
+        return Freedom(*values.T)
+
+    @cached_property
+    def group_numbers(self) -> NDArray[np.int64]:
+        """(columns,) number of the group that each column is fitted with; 0: alone."""
+        given = self.columns.get(schema.GROUP.name)
+        if given is None or self.settings.estimator == "poisson":
+            return np.zeros(self.columns.sizes["column_id"], np.int64)
+        return given.to_numpy().astype(np.int64)
+
+    @cached_property
+    def groups(self) -> tuple[Groups, ...]:
+        """Touching columns, which are fitted together; none with maximum likelihood."""
+        shared = None if self.correlation is None else np.array(self.correlation)
+        return plan_groups(self.group_numbers, self.reference, self.window_px, self.settings, shared)
 
     @cached_property
     def in_units(self) -> Job:

@@ -26,6 +26,7 @@ from .frame_fits import FrameFits
 from .goodness import p_values
 from .incomplete import cut_raw, fit_incomplete
 from .job import Job
+from .joint_fits import Frames, fit_groups, group_corners
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 from .noise_size import frame_noise
 
@@ -66,11 +67,14 @@ class Places(NamedTuple):
         lost = np.isin(np.arange(start, stop), job.lost) & ~job.bad[start:stop]
         return cls(start, drift, job.bad[start:stop], lost, corner, outside, _vacuum(job, drift, shape))
 
-    def boxes(self, job: Job) -> NDArray[np.int64]:
-        """Return what is needed of the frames, as :meth:`Movie.read_tiles` takes it."""
+    def boxes(self, job: Job, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Return what is needed of frames of ``shape`` (y, x), as :meth:`Movie.read_tiles` takes it."""
         halo = gaussian_kernel(job.settings.noise_blur_px).size // 2
         corner = self.corner[~self.outside]
         boxes = [np.concatenate([corner - halo, corner + job.window_px + halo], axis=-1)]
+        for groups in job.groups:
+            corner = group_corners(groups, self.drift, shape).reshape(-1, 2)
+            boxes.append(np.concatenate([corner - halo, corner + np.array(groups.size) + halo], axis=-1))
         if self.vacuum is not None:
             first, side = self.vacuum[:, :2], self.vacuum[:, 2:]
             boxes.append(np.concatenate([first - halo, first + side + halo], axis=-1))
@@ -97,7 +101,7 @@ def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[P
         stop = min(start + movie.layer_frames, shard.stop)
         if not whole:
             places = Places.of(movie.shape[1:], start, stop, job)
-            yield places, movie.read_tiles(start, stop, places.boxes(job)), gain
+            yield places, movie.read_tiles(start, stop, places.boxes(job, movie.shape[1:])), gain
             continue
         for number, pixels in enumerate(movie.read(start, stop), start):
             filters = job.settings.filters_frames
@@ -117,7 +121,7 @@ def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArra
 def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Values:
     """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
-    good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None])
+    good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None]) & job.counted
     window = job.window_noise
     size, number = frame_noise(in_frame.ratio, good, window.left, window.free)
     in_frame, unknown = in_frame.with_noise(size), in_frame.incomplete | job.settings.filters_frames
@@ -126,7 +130,7 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
     drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     fits.estimates[..., BACKGROUND] -= job.dark_variance
-    chance = p_values(in_frame.ratio, size, window.left, window.level, window.free, number)
+    chance = p_values(in_frame.ratio, size, window.left, window.level, job.freedom, number)
     intensity, intensity_error = intensities(fits.estimates, job.settings.intensity_scale, job.dark_variance)
     return {
         "fit": fits.estimates,
@@ -215,6 +219,7 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
         real = tiles.pixels.dtype.kind == "f"
         if real and (missing := ~np.isfinite(windows.sum(axis=(2, 3)).ravel()) & sound.ravel()).any():
             _fit_again(fits, np.flatnonzero(missing), (tiles, start, places.corner[part], gain), limits, job)
+        fit_groups(fits, Frames(tiles, start, gain, places.drift[part], places.corner[part]), limits, job)
         parts.append(fits)
     return FrameFits.joined(parts, places.outside.shape)
 

@@ -144,6 +144,7 @@ def fit_key(movie: Movie, job: Job) -> str:
     numbers: list[Any] = [movie.gain, int(job.window_px), vacuum, job.refined_by, *job.noise_key]
     kinds = [str(kind) for kind in job.columns["kind"].to_numpy()]
     numbers += [list(job.lost)] if job.lost else []
+    numbers += [{"groups": job.group_numbers.tolist()}] if job.group_numbers.any() else []
     return stage_key("fit", movie.key, counted("fit", fit=job.settings), *arrays, numbers, kinds)
 
 
