@@ -146,8 +146,7 @@ def black_border() -> Iterator[Trial]:
     scene, _ = crystal(step=0.0)
     counts = scene.counts()
     counts[:, :, :50] = counts[:, :, -50:] = 0
-    inner = replace(scene, amplitudes=np.where(np.abs(scene.places[..., 0] - 180) < 105, scene.amplitudes, 0))
-    yield Trial("black for 50 px at both sides", inner, counts)
+    yield Trial("black for 50 px at both sides", scene, counts, border=75.0)
 
 
 def few_electrons() -> Iterator[Trial]:
