@@ -12,7 +12,7 @@ from tract_dask import sum_image
 from tract_dask.errors import InputError
 from tract_dask.kernels.noise import Cells, fit_law
 from tract_dask.report.camera import camera_findings, pattern_words
-from tract_dask.stages.noise import measure_camera
+from tract_dask.stages.noise import _pattern, measure_camera
 from tract_dask.stages.sum import _measured
 from tract_dask.store.camera import NOT_MEASURED, Camera
 
@@ -235,6 +235,13 @@ def test_a_hot_pixel_leaves_no_hole_in_the_sum_whose_offset_is_measured(tmp_path
     assert summed["exposure"][90, 100] == 0
     around = summed["image"][88:93, 98:103]
     assert float(around.min()) < float(around[2, 2]) < float(around.max())
+
+
+def test_frames_that_are_left_out_make_no_pattern():
+    counts, _, _ = frames_of(n=24, shape=(128, 128))
+    used = ~np.isin(np.arange(24), [6, 14, 15, 16, 17, 18])
+    found = _pattern(Recorded(pixels=counts), used, 0.0)
+    assert abs(found.value) < 4 * found.stderr
 
 
 @pytest.mark.parametrize("size", [0.0, 0.05])

@@ -80,7 +80,8 @@ def _pattern(movie: Movie, used: Bools, offset: float) -> Measured | None:
     n_frames, *sides = movie.shape
     rows, columns = (slice(max(0, (side - _MIDDLE_PX) // 2), (side + min(side, _MIDDLE_PX)) // 2) for side in sides)
     runs = max(1, _PIXELS // (_RUN * min(sides[0], _MIDDLE_PX) * min(sides[1], _MIDDLE_PX)))
-    starts = np.unique(np.linspace(0, max(0, n_frames - _RUN), min(runs, -(-n_frames // _RUN))).astype(int))
+    every = np.arange(0, n_frames, _RUN)  # a frame in both halves would be a pattern
+    starts = every[np.linspace(0, len(every) - 1, min(runs, len(every))).astype(int)]
     halves = np.zeros((2, rows.stop - rows.start, columns.stop - columns.start))
     number = 0
     for start in starts.tolist():
