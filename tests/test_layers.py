@@ -89,6 +89,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "greys": [],
         "changepoints": [],
         "hops": [],
+        "linear_motion": [],
         "peaks": [],
         "noise": [],
         "patterns": [],

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
+from ..kernels.linear_motion import moved
 from ..store import results, schema
 from .sites import fit_sites
 from .weights import blocks, drawn_together, scatter_of
@@ -109,6 +110,31 @@ def reference_positions(tracks: xr.Dataset) -> xr.DataArray:
     places = xr.concat([tracks[f"{axis}_ref"] for axis in schema.AXES], dim="axis").transpose("column_id", "axis")
     places = (places * pixel_size_pm(tracks)).assign_coords(axis=schema.texts(schema.AXES))
     return places.rename(None).assign_attrs(units="pm", long_name="Place of the column in the summed image")
+
+
+def places_in_frames(tracks: xr.Dataset) -> xr.DataArray:
+    """Return where the frames show the columns: with the drift, and with the motion that positions are freed from.
+
+    Parameters
+    ----------
+    tracks
+        Results, some frames of them perhaps; fits that are not accepted count as well.
+
+    Returns
+    -------
+    DataArray
+        (frame, column_id, axis) in px of the movie, in memory.
+    """
+    names = [name for name in ("fit", "drift", "motion") if name in tracks]
+    some = tracks[names].sel(parameter=list(schema.AXES)).compute().transpose("frame", ...)
+    places = some["fit"].transpose("frame", "column_id", "parameter").to_numpy()
+    if "motion" in some and some["motion"].any():
+        centre = np.array(tracks.attrs["motion_centre"])
+        places = (centre + moved(places[..., ::-1] - centre, some["motion"].to_numpy()))[..., ::-1]
+    places = places + some["drift"].to_numpy()[:, None]
+    coords = {"frame": some["frame"], "column_id": some["column_id"], "axis": schema.texts(schema.AXES)}
+    about = {"units": "px", "long_name": "Place of the column in the frame"}
+    return xr.DataArray(places, coords, ("frame", "column_id", "axis"), attrs=about)
 
 
 def spread(tracks: xr.Dataset) -> xr.Dataset:

@@ -14,6 +14,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from scipy.ndimage import map_coordinates
 
+from ..analysis.motion import places_in_frames
 from ..errors import SettingsError
 from ..kernels.gaussian.intensity import Floats
 from ..kernels.gaussian.model import evaluate
@@ -91,7 +92,11 @@ def plot_fit(
     """
     _check(tracks, image, column_id, frame)
     one = tracks.sel(column_id=column_id)
-    cut = _in_sum(one, image, column_id) if isinstance(image, xr.Dataset) else _in_frame(one, image, frame, column_id)
+    cut = (
+        _in_sum(one, image, column_id)
+        if isinstance(image, xr.Dataset)
+        else _in_frame(tracks.sel(column_id=[column_id]), image, frame, column_id)
+    )
     figure = new_figure(PAGE_INCHES, 4.4)
     parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))
     above, below = parts
@@ -131,9 +136,10 @@ def _in_sum(one: xr.Dataset, summed: xr.Dataset, column_id: int) -> _Window:
 def _in_frame(one: xr.Dataset, movie: Movie, frame: int | None, column_id: int) -> _Window:
     """Return the window in a frame; only its pixels, and those that the blur reaches, are read."""
     number = int(frame or 0)
-    here = one[["fit", "drift"]].sel(frame=number).compute()
-    fit = here["fit"].to_numpy().copy()
-    fit[[Y, X]] += here["drift"].to_numpy()
+    fit = one["fit"].sel(frame=number)[0].to_numpy().copy()
+    fit[[Y, X]] = places_in_frames(one.sel(frame=[number]))[0, 0]
+    if "motion" in one:
+        fit[THETA] -= one["motion"].sel(frame=number).to_numpy()[0]
     sigma = one.attrs["window_blur_px"]
     reach = one.attrs["window_px"] // 2 + 2 + gaussian_kernel(sigma).size // 2
     if not np.isfinite(fit).all():

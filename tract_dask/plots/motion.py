@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from numpy.typing import NDArray
 
-from ..analysis.motion import displacement, pixel_size_pm, spread, standard_errors
+from ..analysis.motion import displacement, pixel_size_pm, places_in_frames, spread, standard_errors
 from ..analysis.motion import positions as positions_pm
 from ..kernels.gaussian.intensity import Floats
 from ..kernels.windows import blur, gaussian_kernel
@@ -96,7 +96,10 @@ def plot_displacement(
     some = tracks.sel(column_id=check_columns(tracks, chosen, "plot_displacement"))
     size = pixel_size_pm(tracks)
     moved = displacement(some, first, second).compute()
-    places = (positions_pm(some).sel(frame=[first, second]) / size).sel(axis=["x", "y"]).to_numpy()
+    two = some.sel(frame=[first, second])
+    accepted = np.isfinite(positions_pm(two).sel(axis=["x", "y"]).to_numpy())
+    seen = places_in_frames(two).sel(axis=["x", "y"]).to_numpy() - two["drift"].sel(axis=["x", "y"]).to_numpy()[:, None]
+    places = np.where(accepted, seen, np.nan)
     box = _region(some, movie.shape[1:], spacing_px(tracks))
     shift = some["drift"].sel(frame=[first, second]).to_numpy()
     sigma = tracks.attrs["reference_blur_px"]

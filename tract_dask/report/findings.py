@@ -16,6 +16,7 @@ from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
 from .camera import camera_findings, faint_words, pattern_words
+from .crystal import crystal_findings
 from .survey import Survey
 
 LOW_SHARE = 0.9
@@ -98,6 +99,7 @@ def findings(run: Survey) -> list[Finding]:
         _told,
     )
     found = [finding for check in checks for finding in check(run)]
+    found += [Finding(**words) for words in crystal_findings(run)]
     return sorted(found, key=lambda finding: not finding.serious)
 
 

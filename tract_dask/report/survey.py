@@ -181,7 +181,7 @@ def gathered(tracks: xr.Dataset, opened: Callable[[str], Any] | None, values: in
 def _frames(tracks: xr.Dataset, numbers: Floats) -> xr.Dataset:
     of = dict(zip(overview.FRAME, numbers, strict=True))
     of |= {"bad": of["bad"] > 0, "share": of["accepted"] / np.where(of["fits"] > 0, of["fits"], np.nan)}
-    known = tracks[["time", "drift", "drift_measured"]].compute(scheduler="threads")
+    known = tracks[["time", "drift", "drift_measured", "motion"]].compute(scheduler="threads")
     return known.assign({name: ("frame", number) for name, number in of.items()})
 
 

@@ -265,6 +265,9 @@ class FitSettings(Settings):
     max_iterations: int = setting(50, "Most iterations of one fit", low=1, high=10000)
     refine_drift: bool = setting(True, "Correct the drift of each frame by the common motion of its fitted columns")
     refine_columns: int = setting(10, "Fewest accepted columns of a frame for that correction", low=3)
+    drift_columns: tuple[int, ...] | None = setting(
+        None, "IDs of the columns that stand still by definition; unset: the largest part that keeps its distances"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -100,6 +100,7 @@ KEYED: dict[str, tuple[Keyed, ...]] = {
         Keyed("fit.intensity_scale", "paper"),
         Keyed("fit.tolerance_px", 1e-4),
         Keyed("fit.max_iterations", 50),
+        Keyed("fit.drift_columns", None),
     ),
 }
 """The settings of each stage's key. The other settings count by what comes of them: :data:`OTHERWISE`."""

@@ -11,9 +11,10 @@ a Zarr shard (``sharding_indexed``). No piece is decoded for that; each is check
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,11 @@ def write(run: Path, shard: Shard, values: dict[str, NDArray[Any]], frames_per_s
     tail = np.array([shard.index, *lengths], "<u8").tobytes()
     with disk_errors(run):
         disk.append(own_file(run, GROWING), b"".join([*pieces, tail, checksum(tail)]))
+
+
+def piece(name: str, array: NDArray[Any], frames: int) -> bytes:
+    """Return the values of a variable for the frames of one shard as a piece, with the frames of a whole shard."""
+    return b"".join(_piece(name, array, frames))
 
 
 def _piece(name: str, array: NDArray[Any], frames: int) -> tuple[bytes, bytes]:
@@ -221,10 +227,22 @@ def file_place(name: str) -> list[int]:
     return [0] * (len(schema.RESULTS[name].dims) - 1)
 
 
-def joined(parts: Parts, key: str, name: str, shards: range, per_file: int) -> Iterator[bytes]:
+def joined(
+    parts: Parts,
+    key: str,
+    name: str,
+    shards: range,
+    per_file: int,
+    changed: Mapping[int, bytes] = MappingProxyType({}),
+) -> Iterator[bytes]:
     """Yield the bytes of the file that holds a variable of some shards; those that are not done are not in it.
 
-    ``key`` is that of the store.
+    Parameters
+    ----------
+    key
+        That of the store.
+    changed
+        Pieces by the number of their shard, where they are not those of the parts.
 
     Raises
     ------
@@ -235,14 +253,21 @@ def joined(parts: Parts, key: str, name: str, shards: range, per_file: int) -> I
     offset = 0
     for k, shard in enumerate(shards):
         if parts.done[shard]:
-            piece = _checked(parts, shard, name)
-            index[k] = offset, len(piece)
-            offset += len(piece)
-            yield piece
+            data = changed.get(shard) or checked(parts, shard, name)
+            index[k] = offset, len(data)
+            offset += len(data)
+            yield data
     yield mark_of(key, name, shards.start // per_file) + index.tobytes() + checksum(index)
 
 
-def _checked(parts: Parts, shard: int, name: str) -> bytes:
+def checked(parts: Parts, shard: int, name: str) -> bytes:
+    """Return the piece of a variable, checked.
+
+    Raises
+    ------
+    DamagedPartError
+        Where it is damaged or gone.
+    """
     try:
         return parts.stored(shard, name)
     except (ValueError, FileNotFoundError) as error:

@@ -263,6 +263,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
     dataset.attrs |= part_attributes(about.get("part"))
     settings = from_toml(FitSettings, about["settings"], str(path))
     known = (about.get("threshold_scale", 1.0), about.get("dark_variance", 0.0))
+    dataset.attrs["motion_centre"] = about.get("motion_centre", [0.0, 0.0])
     dataset.attrs |= how_fitted(settings, about["window"], about["reference_blur_px"], *known)
     return with_source_coordinates(dataset)
 

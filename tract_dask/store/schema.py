@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError, StoreError
 from ..kernels.gaussian.parameters import PARAMETER_UNITS, PARAMETERS
+from ..kernels.linear_motion import NAMES as MOTIONS
 
 CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain", "offset")
 """What a movie's numbers mean: size of a pixel, time and dose of a frame, counts for one detector unit, and the
@@ -25,7 +26,7 @@ detector units of none."""
 AXES = ("y", "x")
 """Labels of the ``axis`` dimension of a drift."""
 
-SIZES = {"parameter": len(PARAMETERS), "axis": len(AXES), "place": 16}
+SIZES = {"parameter": len(PARAMETERS), "axis": len(AXES), "place": 16, "motion_kind": len(MOTIONS)}
 """Dimensions of the results that have one length always; a ``place`` is one in vacuum."""
 
 
@@ -131,6 +132,16 @@ RESULTS = _declare(
     ),
     Variable("n_iterations", _COLUMN, "int16", "1", "Iterations of the fit", 0),
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
+    Variable(
+        "motion",
+        ("frame", "motion_kind"),
+        "float64",
+        "rad, 1, 1, 1",
+        "Rotation from x towards y, magnification and shears of all columns, which positions are freed from",
+        0.0,
+    ),
+    Variable("motion_measured", ("frame", "motion_kind"), "float64", "rad, 1, 1, 1", "The same, of every frame", _NAN),
+    Variable("motion_stderr", ("frame", "motion_kind"), "float64", "rad, 1, 1, 1", "Standard errors of these", _NAN),
     Variable("drift_measured", ("frame", "axis"), "float64", "px", "The same, before the columns refined it", _NAN),
     Variable("noise", _COLUMN, "float64", "counts", "Noise of a pixel at the column's level, after the filter", _NAN),
     Variable(
@@ -224,6 +235,7 @@ def coordinates(n_frames: int) -> dict[str, Any]:
         "parameter": ("parameter", texts(PARAMETERS)),
         "unit": ("parameter", texts(PARAMETER_UNITS)),
         "axis": ("axis", texts(AXES)),
+        "motion_kind": ("motion_kind", texts(MOTIONS)),
     }
 
 

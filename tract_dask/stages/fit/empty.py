@@ -15,7 +15,8 @@ from ...settings.run import FitSettings
 from ...store.columns import column_dataset
 from ...store.schema import REJECTED
 from .job import Job
-from .measure import Places, damping, fit_places, noise_left, status_of
+from .measure import damping, fit_places, noise_left, status_of
+from .places import Places
 
 EMPTY_PASS = 0.05
 """Share of places without a column whose fits are accepted with the default threshold."""

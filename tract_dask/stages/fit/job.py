@@ -102,6 +102,7 @@ class Job:
             threshold_scale=self.scale,
             residual_share=self.left_over,
             lost=list(self.lost),
+            motion_centre=self.centre.tolist(),
         )
 
     @classmethod
@@ -164,6 +165,16 @@ class Job:
         reference[:, BACKGROUND] += self.dark_variance
         reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
         return reference
+
+    @cached_property
+    def centre(self) -> Floats:
+        """(x, y) in the summed image, px, about which linear motions are: the middle of all columns."""
+        return np.asarray(self.reference[:, [X, Y]].mean(axis=0))
+
+    @cached_property
+    def from_centre(self) -> Floats:
+        """(columns, 2) places in the summed image as (x, y) from the centre, px."""
+        return np.asarray(self.reference[:, [X, Y]] - self.centre)
 
     @property
     def noise_key(self) -> list[float]:
@@ -250,6 +261,7 @@ def prepare(
     window_px = resolve_window(given, movie.shape[1:], spacing)
     blur = resolve_blur(settings.blur_sigma_px, columns)
     settings = replace(settings, blur_sigma_px=blur)
+    _check_drift_columns(settings, columns)
     box = settings.vacuum_box
     check_box(box, movie.shape[1:], shift)
     if box is None and summed is not None:
@@ -279,6 +291,28 @@ def prepare(
         correlation=camera.correlation if camera.shared.size > 1 else None,
         full_scale=_full_scale(movie),
     )
+
+
+def _check_drift_columns(settings: FitSettings, columns: xr.Dataset) -> None:
+    known = columns["column_id"].to_numpy()
+    if settings.drift_columns is None:
+        return
+    if not settings.refine_drift:
+        raise SettingsError(
+            "columns cannot stand still where the drift stays as it was measured",
+            "setting drift_columns (FitSettings)",
+            "refine_drift",
+            "no refine_drift",
+            "Leave out one of both",
+        )
+    if (unknown := sorted(set(settings.drift_columns) - set(known.tolist()))) or not settings.drift_columns:
+        raise SettingsError(
+            "there are no such columns",
+            "setting drift_columns (FitSettings)",
+            f"IDs from {known.min()} to {known.max()}",
+            ", ".join(map(str, unknown)) or "none",
+            "Take the IDs from columns.csv",
+        )
 
 
 def _full_scale(movie: Movie) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from ...kernels.windows import Tiles, cut_windows
 from .frame_fits import FrameFits
 from .groups import Groups, discs
 from .job import Job
+from .places import group_corners, natural_corners
 
 Floats = NDArray[np.float64]
 
@@ -31,14 +32,10 @@ class Frames(NamedTuple):
     gain: float
     drift: Floats
     """(frames, 2) y and x, px."""
+    displaced: Floats
+    """(frames, columns or 1, 2) what linear motion adds to it."""
     corner: NDArray[np.int64]
     """(frames, columns, 2) first row and column of each column's own window."""
-
-
-def group_corners(groups: Groups, drift: Floats, shape: Sequence[int]) -> NDArray[np.int64]:
-    """Return the first row and column of the windows of groups, (frames, n, 2), inside frames of ``shape`` (y, x)."""
-    natural = np.rint(groups.centre + drift[:, None]).astype(np.int64) - np.array(groups.size) // 2
-    return np.asarray(np.clip(natural, 0, np.maximum(np.array(shape) - groups.size, 0)))
 
 
 def fit_groups(fits: FrameFits, frames: Frames, bounds: Sequence[Floats], job: Job) -> None:
@@ -65,7 +62,7 @@ def _fit_class(
     fits: FrameFits, frames: Frames, bounds: Sequence[Floats], groups: Groups, known: Floats, job: Job
 ) -> None:
     """Replace the fits of the members of some groups; ``known`` (frames * columns, 7) are the columns around them."""
-    corner = group_corners(groups, frames.drift, frames.tiles.shape)
+    corner = group_corners(groups, frames.drift, frames.displaced, frames.tiles.shape)
     settings, n_columns = job.settings, frames.corner.shape[1]
     y, x = corner[..., 0], corner[..., 1]
     windows = cut_windows(frames.tiles, y, x, groups.size, settings.window_blur_px, frames.gain, frames.first)
@@ -77,7 +74,7 @@ def _fit_class(
         values[..., [X, Y]] += moved
     if (groups.outer >= 0).any():
         windows -= _around(known, frames, corner, groups)
-    masks, which, shifted = _masks(groups, corner, frames.drift, job.window_px)
+    masks, which, shifted = _masks(groups, corner, frames, job.window_px)
     found = fit_joint(
         windows,
         masks,
@@ -104,12 +101,11 @@ def _offset(frames: Frames, corner: NDArray[np.int64], columns: NDArray[np.int64
 
 
 def _masks(
-    groups: Groups, corner: NDArray[np.int64], drift: Floats, window_px: int
+    groups: Groups, corner: NDArray[np.int64], frames: Frames, window_px: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
     """Return masks, which of them is for each window, and which windows were moved to stay inside the frame."""
-    natural = np.rint(groups.centre + drift[:, None]).astype(np.int64) - np.array(groups.size) // 2
-    by = (natural - corner).reshape(-1, 2)
-    shifted = by.any(axis=1)
+    by: NDArray[Any] = (natural_corners(groups, frames.drift, frames.displaced) - corner).reshape(-1, 2)
+    shifted = np.asarray(by.any(axis=1))
     which = np.tile(np.arange(len(groups.members)), len(corner))
     if not shifted.any():
         return groups.masks, which, shifted

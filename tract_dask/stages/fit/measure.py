@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...kernels import linear_motion
 from ...kernels.centroids import BEST_RADIUS, SMALLEST_RADIUS_PX, window_centroids
 from ...kernels.filling import fill_near
 from ...kernels.gaussian.fit import fit_gaussians
@@ -20,65 +22,32 @@ from ...settings.run import FitSettings
 from ...store.movie import Movie
 from ...store.schema import SIZES, Status
 from ...store.shards import Shard
-from .common_motion import common_motion, masked_median
+from .common_motion import CommonMotion, common_motion, masked_median
 from .filters import above_offset, filter_frame
 from .frame_fits import FrameFits
 from .goodness import p_values
 from .incomplete import cut_raw, fit_incomplete
 from .job import Job
-from .joint_fits import Frames, fit_groups, group_corners
+from .joint_fits import Frames, fit_groups
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 from .noise_size import frame_noise
+from .places import Places
 
 Values = dict[str, np.ndarray[Any, Any]]
 
 _BATCH_BYTES = 4 << 20
 
-_NOISE_SIDE_PX = 256
-"""Blurred with sigma 2 px, a square of this side has noise for 1300 independent values: its size is known to 2 %."""
-
 _LEAST_VACUUM = 0.5
 """So much of the square has to be there."""
 
+_ROUNDS = 4
+"""So often windows are cut again where the crystal turns."""
+
+_CERTAIN = 33.4
+"""Chi-squared of the four numbers of a linear motion at 0.999999."""
+
 _AT_BOUND = 1e-9
 """Share of the interval between its bounds within which a parameter is at its bound."""
-
-
-class Places(NamedTuple):
-    """Where the windows and the vacuum lie in some frames of a movie, from frame ``start`` on."""
-
-    start: int
-    drift: Floats
-    bad: NDArray[np.bool_]
-    lost: NDArray[np.bool_]
-    corner: NDArray[np.int64]
-    """(frames, columns, 2) first row and column of each window."""
-    outside: NDArray[np.bool_]
-    """(frames, columns) whether it leaves the frame."""
-    vacuum: NDArray[np.int64] | None
-    """(frames, 3) first row, first column and side of the square whose noise is measured, if there is vacuum."""
-
-    @classmethod
-    def of(cls, frame: tuple[int, ...], start: int, stop: int, job: Job) -> Places:
-        """Return where they lie in frames of that shape."""
-        drift, shape = job.drift[start:stop], np.array(frame)
-        corner = np.rint(job.reference[None, :, [Y, X]] + drift[:, None]).astype(np.int64) - job.window_px // 2
-        outside = np.any((corner < 0) | (corner + job.window_px > shape), axis=-1)
-        lost = np.isin(np.arange(start, stop), job.lost) & ~job.bad[start:stop]
-        return cls(start, drift, job.bad[start:stop], lost, corner, outside, _vacuum(job, drift, shape))
-
-    def boxes(self, job: Job, shape: tuple[int, ...]) -> NDArray[np.int64]:
-        """Return what is needed of frames of ``shape`` (y, x), as :meth:`Movie.read_tiles` takes it."""
-        halo = gaussian_kernel(job.settings.noise_blur_px).size // 2
-        corner = self.corner[~self.outside]
-        boxes = [np.concatenate([corner - halo, corner + job.window_px + halo], axis=-1)]
-        for groups in job.groups:
-            corner = group_corners(groups, self.drift, shape).reshape(-1, 2)
-            boxes.append(np.concatenate([corner - halo, corner + np.array(groups.size) + halo], axis=-1))
-        if self.vacuum is not None:
-            first, side = self.vacuum[:, :2], self.vacuum[:, 2:]
-            boxes.append(np.concatenate([first - halo, first + side + halo], axis=-1))
-        return np.concatenate(boxes)
 
 
 def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Values:
@@ -94,21 +63,39 @@ def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Val
     return {name: np.concatenate([values[name] for values in parts]) for name in parts[0]}
 
 
-def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[Places, Tiles, float]]:
-    """Yield what lies where, the pixels, and the gain that these still lack: of a layer of tiles, or a whole frame."""
-    gain = movie.gain / job.unit
+class _Pixels(NamedTuple):
+    """The tiles of some frames in which windows at given places lie."""
+
+    tiles: Callable[[Places], Tiles]
+    stop: int
+    """The frame after the last one."""
+    gain: float
+    """What they still lack."""
+
+
+def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[Places, _Pixels]]:
+    """Yield what lies where, and its pixels: of a layer of tiles, or a whole frame."""
+    gain, frame_shape = movie.gain / job.unit, movie.shape[1:]
     for start in range(shard.start, shard.stop, movie.layer_frames):
         stop = min(start + movie.layer_frames, shard.stop)
         if not whole:
-            places = Places.of(movie.shape[1:], start, stop, job)
-            yield places, movie.read_tiles(start, stop, places.boxes(job, movie.shape[1:])), gain
+            read = partial(_read_tiles, movie, start, stop, job)
+            yield Places.of(frame_shape, start, stop, job), _Pixels(read, stop, gain)
             continue
         for number, pixels in enumerate(movie.read(start, stop), start):
             filters = job.settings.filters_frames
             pixels = above_offset(pixels, movie.offset) if filters else pixels
             frame, lacking = (_filtered(pixels, job.settings, gain), 1.0) if filters else (pixels, gain)
-            tiles = Tiles(frame[None, None], np.zeros((1, 1), np.int64), movie.shape[1:])
-            yield Places.of(movie.shape[1:], number, number + 1, job), tiles, lacking
+            tiles = Tiles(frame[None, None], np.zeros((1, 1), np.int64), frame_shape)
+            yield Places.of(frame_shape, number, number + 1, job), _Pixels(partial(_same, tiles), number + 1, lacking)
+
+
+def _read_tiles(movie: Movie, start: int, stop: int, job: Job, places: Places) -> Tiles:
+    return movie.read_tiles(start, stop, places.boxes(job, movie.shape[1:]))
+
+
+def _same(tiles: Tiles, _: Places) -> Tiles:
+    return tiles
 
 
 def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArray[np.float32]:
@@ -118,8 +105,13 @@ def _filtered(frame: NDArray[Any], settings: FitSettings, gain: float) -> NDArra
     return np.where(there, filter_frame(fill_near(frame), settings, gain), np.float32(np.nan))
 
 
-def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Values:
-    """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image."""
+def _measure_frames(places: Places, pixels: _Pixels, job: Job, rounds: int = _ROUNDS) -> Values:
+    """Return the values of some frames, whose positions go from the windows to the frame, and to the summed image.
+
+    Where the crystal has turned or grown so far that windows no longer hold their columns in the middle, they are cut
+    again where it has carried them.
+    """
+    tiles, gain = pixels.tiles(places), pixels.gain
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
     good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None]) & job.counted
     window = job.window_noise
@@ -127,7 +119,11 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
     in_frame, unknown = in_frame.with_noise(size), in_frame.incomplete | job.settings.filters_frames
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
     status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
-    drift: Floats = places.drift + common_motion(in_frame.estimates, status, places.drift, job)
+    common = common_motion(in_frame.estimates, status, places.drift, job)
+    if rounds and (displaced := _carried(common, places, job)) is not None:
+        again = Places.of(tiles.shape, places.start, pixels.stop, job, displaced)
+        return _measure_frames(again, pixels, job, rounds - 1)
+    drift: Floats = places.drift + common.shift
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     fits.estimates[..., BACKGROUND] -= job.dark_variance
     chance = p_values(in_frame.ratio, size, window.left, window.level, job.freedom, number)
@@ -146,8 +142,24 @@ def _measure_frames(places: Places, tiles: Tiles, gain: float, job: Job) -> Valu
         "p_value": np.where(unknown, np.nan, chance).astype(np.float32),
         "n_iterations": fits.n_iterations,
         "drift": drift,
+        "motion": np.zeros((len(drift), SIZES["motion_kind"])),
+        "motion_measured": common.linear,
+        "motion_stderr": common.stderr,
         "noise": job.unit * noise,
     }
+
+
+def _carried(common: CommonMotion, places: Places, job: Job) -> Floats | None:
+    """Return how far (y, x) linear motion carries the columns, (frames, columns, 2); None where windows are good.
+
+    It counts where it stands out of its errors, and is more than a quarter of how far a column may be from its place.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        certain = ((common.linear / common.stderr) ** 2).sum(axis=1) > _CERTAIN
+    motion = np.where(certain[:, None], common.linear, 0)
+    displaced = (linear_motion.moved(job.from_centre, motion) - job.from_centre)[..., ::-1]
+    more = np.hypot(*np.moveaxis(displaced - places.displaced, -1, 0)).max(axis=1, initial=0)
+    return displaced if (more > _reach(job) / 4).any() else None
 
 
 def _noise(
@@ -219,7 +231,12 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
         real = tiles.pixels.dtype.kind == "f"
         if real and (missing := ~np.isfinite(windows.sum(axis=(2, 3)).ravel()) & sound.ravel()).any():
             _fit_again(fits, np.flatnonzero(missing), (tiles, start, places.corner[part], gain), limits, job)
-        fit_groups(fits, Frames(tiles, start, gain, places.drift[part], places.corner[part]), limits, job)
+        fit_groups(
+            fits,
+            Frames(tiles, start, gain, places.drift[part], places.displaced[part], places.corner[part]),
+            limits,
+            job,
+        )
         parts.append(fits)
     return FrameFits.joined(parts, places.outside.shape)
 
@@ -344,7 +361,7 @@ def noise_left(sigma: float, correlation: Sequence[Sequence[float]] | None = Non
 
 def _bounds(places: Places, job: Job) -> tuple[Floats, Floats, Floats]:
     """Return start values and bounds, each (frames, columns, 7), in the coordinates of the windows."""
-    offset = places.drift[:, None] - places.corner  # from the summed image to the window
+    offset = places.drift[:, None] + places.displaced - places.corner  # from the summed image to the window
     settings, reference = job.settings, job.reference
     amplitude = settings.amplitude_factor * reference[:, AMPLITUDE]
     span = np.abs(reference[:, BACKGROUND]) + np.abs(amplitude)
@@ -370,21 +387,6 @@ def _bounds(places: Places, job: Job) -> tuple[Floats, Floats, Floats]:
 def _reach(job: Job) -> float:
     """Return how far a column may be from its place in the summed image, along x and along y, px."""
     return min(job.settings.max_shift_px or job.window_px / 4, job.window_px / 2)
-
-
-def _vacuum(job: Job, drift: Floats, shape: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return where the noise is measured: in each frame the first row and column, and the side, of a square; (f, 3).
-
-    It is the middle of the vacuum box, no larger than what the noise takes, moved with the drift and kept inside the
-    frame. None where there is no vacuum.
-    """
-    if job.vacuum is None:
-        return None
-    y0, y1, x0, x1 = job.vacuum
-    side = min(y1 - y0, x1 - x0, _NOISE_SIDE_PX)
-    corner = np.array([y0 + y1 - side, x0 + x1 - side]) // 2 + np.rint(drift).astype(np.int64)
-    corner = np.clip(corner, 0, shape - side)
-    return np.column_stack([corner, np.full(len(corner), side)])
 
 
 def _squares(

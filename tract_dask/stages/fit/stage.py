@@ -25,6 +25,7 @@ from ...store.provenance import processor, widths
 from ...store.schema import REJECTED, Status
 from ...store.shards import Shard
 from ..keep import Workers, is_done
+from .crystal import Crystal, judged
 from .empty import calibrated
 from .job import Job, calibration, prepare
 from .join import join
@@ -73,8 +74,8 @@ def fit_movie(
     done_frames = journal.frames_done(movie.shards)
     on_event(StageStarted("fit", movie.n_frames, done_frames, len(job.reference), movie.frame_bytes))
     with hold(Folder.at(path)):
-        summary, processors = _fit_whole(movie, path, journal, client, on_event)
-        results.finish(path, summary=summary, processors=sorted(processors))
+        summary, processors, crystal = _fit_whole(movie, path, journal, job, client, on_event)
+        results.finish(path, summary=summary, processors=sorted(processors), **(crystal.told(job) if crystal else {}))
     journal.remove()
     if len(mixed := widths(processors)) > 1:
         lanes = " and ".join(map(str, mixed))
@@ -86,19 +87,23 @@ def fit_movie(
 
 
 def _fit_whole(
-    movie: Movie, path: Path, journal: Journal, client: Client | None, on_event: Sink
-) -> tuple[dict[str, int], set[str]]:
-    """Fit and join all shards, those again that are found damaged then; return what :func:`_fit_shards` does."""
+    movie: Movie, path: Path, journal: Journal, job: Job, client: Client | None, on_event: Sink
+) -> tuple[dict[str, int], set[str], Crystal | None]:
+    """Fit and join all shards, those again that are found damaged then; return what :func:`_fit_shards` does.
+
+    The last value is how positions were put right.
+    """
     for attempt in range(_ATTEMPTS):
         found = _fit_shards(movie, path, journal, client, on_event)
         try:
-            join(path, journal, client, on_event, attempt)
-            break
+            crystal = judged(journal, path, job)
+            join(path, journal, client, on_event, attempt, crystal)
+            return *found, crystal
         except DamagedPartError as error:
             if attempt == _ATTEMPTS - 1:
                 raise
             on_event(Warned(f"{error.what}: they are made again"))
-    return found
+    raise AssertionError("unreachable")
 
 
 def _goes_on(path: Path, key: str, on_event: Sink) -> bool:

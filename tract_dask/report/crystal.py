@@ -1,0 +1,62 @@
+"""What a report says of the crystal as a whole: how it turned, and which columns moved against the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..kernels.linear_motion import moved
+from .survey import Survey
+
+BLURRED = 0.25
+"""Share of the columns' sigma by which a motion may carry the farthest ones about in the summed image."""
+MANY = 0.5
+"""Share of the columns that must stand still for the others to be those that move."""
+
+
+def crystal_findings(run: Survey) -> Iterator[dict[str, Any]]:
+    """Yield what there is to say of the crystal: name, title, text, remedy and whether it is serious."""
+    if undone := run.about.get("motions_undone"):
+        yield _turned(run, undone)
+    if moving := run.about.get("not_reference"):
+        share = 1 - len(moving) / run.tracks.sizes["column_id"]
+        if undone or share > 1 - 1 / max(1, run.tracks.sizes["column_id"]):
+            return
+        yield {
+            "name": "moving_columns",
+            "title": "A part of the columns moved against the others",
+            "text": (
+                f"{len(moving):,} of {run.tracks.sizes['column_id']:,} columns did not keep their distances from the "
+                "others. Positions are relative to the largest part that did: it stands still by definition."
+            ),
+            "remedy": "" if share > MANY else "Half of the columns or more moved: look which part is the reference.",
+            "serious": share <= MANY,
+        }
+
+
+def _turned(run: Survey, undone: list[str]) -> dict[str, Any]:
+    motion = run.frames["motion"].to_numpy()
+    ends = np.ptp(np.nan_to_num(motion), axis=0)
+    sizes = [f"turned by {np.rad2deg(ends[0]):.2g} degrees"] if "rotation" in undone else []
+    sizes += [f"grew or shrank by {ends[1]:.2g} times its size"] if "magnification" in undone else []
+    sizes += [f"sheared by {max(ends[2:]):.2g}"] if "shear" in undone else []
+    places = np.stack([run.tracks["x_ref"], run.tracks["y_ref"]], axis=-1) - np.array(run.tracks.attrs["motion_centre"])
+    carried = moved(places, motion)
+    farthest = float(np.linalg.norm(carried.std(axis=0), axis=-1).max())
+    sigma = float(np.nanmedian(run.tracks["fit_ref"].sel(parameter=["sigma_a", "sigma_b"])))
+    text = f"The crystal {' and '.join(sizes)} over the movie. Positions are freed from that (motion in the results)."
+    blurred = farthest > BLURRED * sigma
+    if blurred:
+        text += (
+            f" The summed image is not: it shows the columns farthest from the middle blurred by {farthest:.1f} px, "
+            "and their amplitudes and intensities are off."
+        )
+    return {
+        "name": "crystal_motion",
+        "title": "The crystal turned or changed its size",
+        "text": text,
+        "remedy": "Run parts of the movie one by one (--frames) for the intensities of these columns." * blurred,
+        "serious": blurred,
+    }
