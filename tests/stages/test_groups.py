@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tract_dask import accepted, convert, find_columns, fit_columns, open_movie, sum_image
-from tract_dask.kernels.gaussian.model import blurred
+from tract_dask.kernels.gaussian.model import blurred, gaussian_image
 from tract_dask.kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from tract_dask.kernels.windows import blur_variance
-from tract_dask.settings import FitSettings
+from tract_dask.settings import ColumnSettings, FitSettings
 from tract_dask.stages.fit import job as fit_job
 from tract_dask.stages.fit.groups import plan_groups
 from tract_dask.stages.groups import groups_of
@@ -230,3 +230,31 @@ def test_given_pairs_are_grouped_and_their_shapes_are_right(pairs, movie):
         (truth[1:n:2] - truth[:n:2]) / np.hypot(*(truth[1:n:2] - truth[:n:2]).T)[:, None],
     )
     assert abs(np.nanmean(outward)) < 2 * BIAS_PX
+
+
+@pytest.mark.parametrize("method", ["auto", "maxima"])
+def test_both_columns_of_pairs_are_found(pairs, movie, method):
+    """With defaults: both of each pair, no third, and those that are alone once."""
+    columns = find_columns(sum_image(movie), ColumnSettings(method=method))
+    truth = np.concatenate([pairs.places, pairs.alone])
+    away = np.hypot(*(positions(columns)[:, None] - truth[None]).transpose(2, 0, 1))
+    assert columns.sizes["column_id"] == len(truth)
+    assert away.min(axis=0).max() < 0.3
+    own = columns["group"].to_numpy()[away.argmin(axis=0)]
+    n = len(pairs.places)
+    assert (own[:n:2] == own[1:n:2]).all()
+    assert (own[:n] > 0).all()
+    assert (own[n:] == 0).all()
+
+
+def test_long_columns_are_not_two(movie_of):
+    """Columns 25 % longer than wide, and round ones: with noise, each stays one."""
+    y, x = np.mgrid[20:200:30, 20:200:30].reshape(2, -1).astype(float)
+    columns = np.zeros((len(x), 7))
+    columns[:, [X, Y]] = np.column_stack([x, y])
+    columns[:, AMPLITUDE], columns[:, 3], columns[:, 4], columns[:, 5] = 60.0, 4.0, 3.2, 0.4
+    expected = gaussian_image(columns, (200, 200)).sum(axis=0) + 20
+    frames = np.random.default_rng(3).poisson(expected, (20, 200, 200)).astype(np.uint16)
+    found = find_columns(sum_image(movie_of(frames)))
+    assert found.sizes["column_id"] == len(x)
+    assert not found["group"].to_numpy().any()

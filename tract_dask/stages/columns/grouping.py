@@ -1,4 +1,4 @@
-"""Columns that touch: which of them are fitted together, and their joint fits on the summed image."""
+"""Columns that touch: those that were missed, which are fitted together, and their joint fits on the summed image."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...kernels.gaussian.model import blurred
 from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
+from ...kernels.windows import blur_variance
 from ...settings.run import ColumnSettings
 from ..groups import groups_of
 from .group_fits import Summed, fit_touching
 from .relief import damping
 from .scene import Scene
 from .singles import SIGNIFICANT, Fits, Seeds, fitted_alone
+from .touching import Image, touching_columns
 from .twins import twins_of
 from .window_size import neighbour_distance
 
 Floats = NDArray[np.float64]
 
+_MOVED_PX = 1e-6
 _SAME = 1.2
 """Columns nearer than so many sigmas are the same one, found twice."""
 
@@ -36,9 +40,10 @@ class Grouped:
 def grouped(
     scene: Scene, settings: ColumnSettings, seeds: Seeds, spacing: float, fits: Fits, window_px: int | None
 ) -> Grouped:
-    """Return the columns with their groups; touching ones are fitted together, in windows that suit their groups.
+    """Return the columns with their groups, and with those that were missed.
 
-    Where no columns touch, their fits are as they were.
+    Touching ones are fitted together, in windows that suit their groups. Where no columns touch, their fits are as they
+    were. Given columns (``seeds.fixed``) remain the only ones.
 
     Parameters
     ----------
@@ -48,9 +53,14 @@ def grouped(
         As it was given; None: half the distance of blobs.
     """
     columns = _without_twins(fits, spacing)
+    if not seeds.fixed and np.isfinite(columns).all(axis=1).any():
+        columns, more, more_fits = _with_missed(scene, seeds, spacing, fits, columns)
+    else:
+        more, more_fits = seeds, fits
     groups = groups_of(_narrow(columns))
     if not groups.any():
-        return Grouped(seeds, spacing, fits, groups)
+        return Grouped(seeds, spacing, fits, np.zeros(len(seeds.places), np.int64))
+    seeds, fits = more, more_fits
     places = fits.places.copy()
     places[groups > 0] = columns[groups > 0][:, [X, Y]]
     here = replace(seeds, places=places)
@@ -67,6 +77,26 @@ def grouped(
     kept = final > 0
     whole_fit, flags = np.where(kept[:, None], joint, alone.fit), np.where(kept, status, alone.status)
     return Grouped(here, spacing, replace(alone, fit=whole_fit, status=flags.astype(np.uint8)), final)
+
+
+def _with_missed(scene: Scene, seeds: Seeds, spacing: float, fits: Fits, columns: Floats) -> tuple[Floats, Seeds, Fits]:
+    """Return columns (n, 7), seeds and fits with the columns that were missed beside those that were found."""
+    variance = blur_variance(fits.blur_sigma_px)
+    lattice = next(iter(scene.lattices.values()), None)
+    cell = max(spacing, lattice.spacing) if lattice else spacing
+    image = Image(scene.counts, scene.valid, scene.noise, scene.sign)
+    found, parent = touching_columns(image, blurred(columns, -variance), cell / 2)
+    n, added = len(columns), len(found) - len(columns)
+    if not added:
+        return columns, seeds, fits
+    changed = np.abs(found[:n, [X, Y]] - columns[:, [X, Y]]).max(axis=1) > _MOVED_PX
+    whole = np.concatenate(
+        [np.where(changed[:, None], blurred(found[:n], variance), columns), blurred(found[n:], variance)]
+    )
+    number = np.concatenate([seeds.number, seeds.number.max(initial=0) + 1 + np.arange(added)])
+    places = np.concatenate([fits.places, whole[n:, [X, Y]]])
+    more = replace(seeds, places=places, kind=seeds.kind[parent], number=number)
+    return whole, more, replace(fits, places=places)
 
 
 def _narrow(columns: Floats) -> Floats:
