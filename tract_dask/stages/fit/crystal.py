@@ -33,8 +33,11 @@ CHANGED = ("fit", "centroid", "drift", "motion")
 _EPOCHS = 16
 """The movie is looked at in so many parts, over which positions are averaged."""
 
-_MOST_SHARDS = 64
-"""So many shards tell of the whole movie."""
+_MOST_SHARDS, _FEWEST_SHARDS, _MOST_FITS = 64, 4, 8_000_000
+"""So many shards tell of the whole movie; fewer where they hold more fits than this."""
+
+_FITS_AT_ONCE = 1 << 19
+"""Positions are put right for so many fits at a time."""
 
 _FEWEST_FRAMES = 3
 """In fewer frames nothing is told."""
@@ -96,6 +99,12 @@ class Crystal:
 
     def put_right(self, values: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Return :data:`CHANGED` of some frames from their fits as :func:`.measure.measure` returns them."""
+        step = max(1, _FITS_AT_ONCE // len(self.reference))
+        starts = range(0, len(values["fit"]), step)
+        parts = [self._put_right({name: of[k : k + step] for name, of in values.items()}) for k in starts]
+        return {name: np.concatenate([part[name] for part in parts]) for name in CHANGED}
+
+    def _put_right(self, values: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         good = ((values["status"] & schema.REJECTED) == 0) & self.reference
         fit, centroid, drift = values["fit"].copy(), values["centroid"].copy(), values["drift"].copy()
         seen = fit[..., [X, Y]] - self.centre
@@ -175,7 +184,8 @@ class _Seen:
     def of(cls, parts: Parts, frames: int, step: int, job: Job) -> _Seen | None:
         """Return what some shards tell; None where no column is seen often enough."""
         shards = np.flatnonzero(parts.done)
-        shards = shards[np.unique(np.linspace(0, len(shards) - 1, _MOST_SHARDS).round().astype(int))]
+        most = int(np.clip(_MOST_FITS // (step * len(job.reference)), _FEWEST_SHARDS, _MOST_SHARDS))
+        shards = shards[np.unique(np.linspace(0, len(shards) - 1, most).round().astype(int))]
         fit = np.empty((step, len(job.reference), schema.SIZES["parameter"]))
         status = np.empty(fit.shape[:2], np.uint8)
         places, numbers = [], []
