@@ -815,3 +815,49 @@ def test_p_values_of_the_sum_tell_noise_from_a_second_column():
     found = residuals(tracks.assign_attrs(reference_blur_px=2.0), summed).p_value
     assert found[40] < 1e-4
     assert 0.001 < (np.delete(found, 40) < 0.01).mean() < 0.03
+
+
+def touching_run(folder, apart_px, error_px=ERROR_PX, group=(1, 1), **fit):
+    """The usual run, whose first two columns are so far apart."""
+    run = Run(folder)
+    first = run.columns["fit_ref"].to_numpy()
+    first[1, 1:3] = first[0, 1:3] + [apart_px, 0.0]
+    run.columns["x_ref"].to_numpy()[1], run.columns["y_ref"].to_numpy()[1] = first[1, 1:3]
+    run.values["fit"][:, 1, 1:3] += first[1, 1:3] - run.values["fit"][:, 1, 1:3].mean(axis=0)
+    run.values["stderr"][:, :2] = error_px
+    run.columns["group"] = "column_id", np.array([*group, *[0] * (len(first) - 2)])
+    run.settings = RunSettings(fit=FitSettings(**fit))
+    return {finding.name: finding for finding in findings(survey(run.write(), []))}
+
+
+def test_touching_columns_that_were_fitted_alone_are_told(tmp_path):
+    together, likely, given = (tmp_path / name for name in ("together", "likely", "given"))
+    for folder in (together, likely, given):
+        folder.mkdir()
+    assert "touching_alone" not in touching_run(together, 11.0)
+    found = touching_run(likely, 11.0, estimator="poisson")["touching_alone"]
+    assert "column 1 and 2" in found.text
+    assert "--estimator lsq" in found.remedy
+    assert "given" in touching_run(given, 11.0, group=(0, 0))["touching_alone"].text
+
+
+def test_pairs_whose_errors_are_as_large_as_their_distance_are_told(tmp_path):
+    (tmp_path / "sharp").mkdir()
+    (tmp_path / "blind").mkdir()
+    assert "unresolved" not in touching_run(tmp_path / "sharp", 8.0, error_px=1.0)
+    assert "1-2" in touching_run(tmp_path / "blind", 8.0, error_px=3.0)["unresolved"].text
+
+
+def test_a_crystal_that_turned_and_one_that_slipped_are_told(tmp_path):
+    for name in ("still", "turned", "slipped"):
+        (tmp_path / name).mkdir()
+    assert not {"crystal_motion", "moving_columns"} & {
+        finding.name for finding in findings(survey(Run(tmp_path / "still").write(), []))
+    }
+    turned = Run(tmp_path / "turned", motions_undone=["rotation"], not_reference=[], motion_centre=[70.0, 100.0])
+    turned.values["motion"][:, 0] = np.deg2rad(np.linspace(-1.5, 1.5, N_FRAMES))
+    found = {finding.name: finding for finding in findings(survey(turned.write(), []))}
+    assert "turned by 3 degrees" in found["crystal_motion"].text
+    slipped = Run(tmp_path / "slipped", motions_undone=[], not_reference=[1, 2, 3])
+    found = {finding.name: finding for finding in findings(survey(slipped.write(), []))}
+    assert found["moving_columns"].text.startswith("3 of ")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,27 +15,30 @@ MANY = 0.5
 """Share of the columns that must stand still for the others to be those that move."""
 
 
-def crystal_findings(run: Survey) -> Iterator[dict[str, Any]]:
-    """Yield what there is to say of the crystal: name, title, text, remedy and whether it is serious."""
-    if undone := run.about.get("motions_undone"):
-        yield _turned(run, undone)
-    if moving := run.about.get("not_reference"):
-        share = 1 - len(moving) / run.tracks.sizes["column_id"]
-        if undone or share > 1 - 1 / max(1, run.tracks.sizes["column_id"]):
-            return
-        yield {
-            "name": "moving_columns",
-            "title": "A part of the columns moved against the others",
-            "text": (
-                f"{len(moving):,} of {run.tracks.sizes['column_id']:,} columns did not keep their distances from the "
-                "others. Positions are relative to the largest part that did: it stands still by definition."
-            ),
-            "remedy": "" if share > MANY else "Half of the columns or more moved: look which part is the reference.",
-            "serious": share <= MANY,
-        }
+def slip_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of columns that moved against the others; None where a single one did, or none."""
+    moving, number = run.about.get("not_reference") or (), run.tracks.sizes["column_id"]
+    if run.about.get("motions_undone") or len(moving) < 2:
+        return None
+    few = len(moving) > (1 - MANY) * number
+    text = (
+        f"{len(moving):,} of {number:,} columns did not keep their distances from the others. Positions are relative "
+        "to the largest part that did: it stands still by definition."
+    )
+    remedy = "Half of the columns or more moved: look which part is the reference (fit.drift_columns)." if few else ""
+    return {
+        "title": "A part of the columns moved against the others",
+        "text": text,
+        "remedy": remedy,
+        "serious": few,
+    }
 
 
-def _turned(run: Survey, undone: list[str]) -> dict[str, Any]:
+def motion_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of a crystal that turned, grew or sheared; None where none did."""
+    undone = run.about.get("motions_undone")
+    if not undone:
+        return None
     motion = run.frames["motion"].to_numpy()
     ends = np.ptp(np.nan_to_num(motion), axis=0)
     sizes = [f"turned by {np.rad2deg(ends[0]):.2g} degrees"] if "rotation" in undone else []
@@ -54,7 +56,6 @@ def _turned(run: Survey, undone: list[str]) -> dict[str, Any]:
             "and their amplitudes and intensities are off."
         )
     return {
-        "name": "crystal_motion",
         "title": "The crystal turned or changed its size",
         "text": text,
         "remedy": "Run parts of the movie one by one (--frames) for the intensities of these columns." * blurred,

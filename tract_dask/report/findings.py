@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +15,10 @@ from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
 from .camera import camera_findings, faint_words, pattern_words
-from .crystal import crystal_findings
+from .crystal import motion_words, slip_words
+from .finding import Finding, count, named
 from .survey import Survey
+from .touching import alone_words, unresolved_words
 
 LOW_SHARE = 0.9
 """Fewer accepted fits than this share of all that were made are worth a warning."""
@@ -54,32 +55,6 @@ SPACINGS = 0.6, 1.6
 """Distance of the columns, in periods of the image, between which it may be."""
 MASKED = 0.01
 """Share of the pixels that the mask may hold: cameras have far fewer faulty ones."""
-_NAMED = 10
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something to know.
-
-    Attributes
-    ----------
-    name
-        What kind of finding it is.
-    title
-        In a few words.
-    text
-        With its numbers.
-    remedy
-        What can be done.
-    serious
-        Whether it is a warning; otherwise it is only good to know.
-    """
-
-    name: str
-    title: str
-    text: str
-    remedy: str = ""
-    serious: bool = True
 
 
 def findings(run: Survey) -> list[Finding]:
@@ -96,36 +71,11 @@ def findings(run: Survey) -> list[Finding]:
         _flags,
         _errors,
         _drift,
+        _crystal,
         _told,
     )
     found = [finding for check in checks for finding in check(run)]
-    found += [Finding(**words) for words in crystal_findings(run)]
     return sorted(found, key=lambda finding: not finding.serious)
-
-
-def named(numbers: Iterable[int]) -> str:
-    """Return numbers for a sentence, the first few of them.
-
-    Examples
-    --------
-    >>> named([3, 4, 9]), named([7]), named(range(12))
-    ('3, 4 and 9', '7', '0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 2 more')
-    """
-    every = [str(number) for number in numbers]
-    first, rest = every[:_NAMED], every[_NAMED:]
-    last = f"{len(rest)} more" if rest else first.pop() if first else ""
-    return f"{', '.join(first)} and {last}" if first else last
-
-
-def count(number: int, what: str) -> str:
-    """Return a number of things, in the singular or the plural.
-
-    Examples
-    --------
-    >>> count(1, "frame"), count(12_000, "frame")
-    ('1 frame', '12,000 frames')
-    """
-    return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def _mixed(run: Survey) -> Iterator[Finding]:
@@ -427,6 +377,17 @@ def _spacing(run: Survey) -> float | None:
     from ..stages.columns.window_size import neighbour_distance
 
     return neighbour_distance(np.stack([run.columns["x_ref"], run.columns["y_ref"]], axis=1))
+
+
+def _crystal(run: Survey) -> Iterator[Finding]:
+    if words := motion_words(run):
+        yield Finding("crystal_motion", **words)
+    if words := slip_words(run):
+        yield Finding("moving_columns", **words)
+    if words := alone_words(run):
+        yield Finding("touching_alone", **words)
+    if words := unresolved_words(run):
+        yield Finding("unresolved", **words)
 
 
 def _told(run: Survey) -> Iterator[Finding]:

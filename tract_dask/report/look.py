@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ..store import metadata
 from ..store.run_folder import RunFolder
-from .findings import Finding, findings
+from .finding import Finding
+from .findings import findings
 from .page import is_current, run_key, write_page
 from .survey import Survey, events_of, survey
 

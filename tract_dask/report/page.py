@@ -30,7 +30,8 @@ from ..store.run_folder import RunFolder
 from ..web import bundle
 from ..web.bundle import STATIC
 from . import interactive
-from .findings import RESIDUAL, count, findings
+from .finding import count
+from .findings import RESIDUAL, findings
 from .pictures import MASK_COLOURS, figure_data, mask_data, windows_data
 from .residuals import residual_windows
 from .survey import Survey, events_of, median, percentiles, survey
