@@ -1,6 +1,7 @@
 """Linear motion against closed forms, and its estimates against known truth."""
 
 import numpy as np
+import pytest
 from scipy.linalg import expm
 
 from tract_dask.kernels import linear_motion
@@ -58,7 +59,21 @@ def test_first_estimates_state_their_errors():
     assert (np.abs(pull.mean(axis=0)) < 0.15).all()
 
 
-def test_columns_on_a_line_tell_of_no_motion():
-    places = np.column_stack([np.arange(20.0), np.zeros(20)])
+@pytest.mark.parametrize(
+    "places",
+    [
+        np.column_stack([np.arange(20.0), np.zeros(20)]),
+        np.column_stack([np.arange(20.0), 0.05 * (-1) ** np.arange(20)]),
+    ],
+)
+def test_columns_on_a_line_tell_of_no_motion(places):
     motion, _ = linear_motion.estimate(np.zeros((2, 20, 2)), places, np.ones((2, 20)))
     assert np.isnan(motion).all()
+
+
+def test_motion_takes_ten_columns_and_a_shift_alone_one():
+    few = np.arange(100) * 7 % 100 < np.array([9, 10])[:, None]
+    motion, _ = linear_motion.estimate(np.zeros((2, 100, 2)), PLACES, few.astype(float))
+    assert np.isnan(motion).all(axis=1).tolist() == [True, False]
+    shift, _ = linear_motion.fit(PLACES[None] + [3.0, -2.0], PLACES, np.ones(100), np.arange(100)[None] == 5, ())
+    np.testing.assert_allclose(shift[0], [3.0, -2.0], atol=1e-9)

@@ -1,18 +1,23 @@
 """A crystal that turns, grows or slips: what is undone, and which columns stand still; against known truth."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from conftest import Scene
 
-from tract_dask import convert, open_movie, open_results
+from tract_dask import convert, fit_columns, open_movie, open_results
 from tract_dask.analysis.jumps import change_points
 from tract_dask.analysis.motion import places_in_frames
 from tract_dask.errors import SettingsError
 from tract_dask.kernels import linear_motion
+from tract_dask.kernels.gaussian.parameters import X, Y
 from tract_dask.settings import ConvertSettings, FitSettings
+from tract_dask.stages.fit.crystal import judge
 from tract_dask.stages.fit.job import prepare
 from tract_dask.stages.fit.stage import fit_movie
 from tract_dask.store import metadata
+from tract_dask.store.schema import Status
 
 N_FRAMES = 24
 SLIP_PX = 0.6
@@ -99,6 +104,83 @@ def test_columns_that_are_named_stand_still(npy, tmp_path):
     step = np.nanmean(x[N_FRAMES // 2 :], axis=0) - np.nanmean(x[: N_FRAMES // 2], axis=0)
     assert abs(step[crystal.block].mean()) < 0.1
     assert abs(step[~crystal.block].mean() + SLIP_PX) < 0.1
+
+
+class Fits:
+    """Fits (frames, columns, 2) of x and y, in one shard, as the journal's parts give them; NaN is not accepted."""
+
+    done = np.ones(1, bool)
+
+    def __init__(self, away, job):
+        places = away + job.reference[:, [X, Y]]
+        size = np.linalg.norm(away, axis=-1)
+        weight = np.clip(1 - (np.nan_to_num(size, nan=9) / 0.6) ** 2, 0, None) ** 2  # as robust as the fits' motion
+        motion = linear_motion.estimate(away, job.from_centre, weight)
+        self.values = {
+            "fit": np.repeat(places[..., :1], 7, axis=-1),
+            "status": np.where(np.isnan(away[..., 0]), Status.NOT_CONVERGED, 0).astype(np.uint8),
+            "motion_measured": motion[0],
+            "motion_stderr": motion[1],
+        }
+        self.values["fit"][..., [X, Y]] = places
+
+    def read(self, shard, name, into):
+        into[:] = self.values[name]
+
+
+def still(columns):
+    """A job with a square of columns that are 30 px apart."""
+    side = np.ceil(np.sqrt(columns))
+    reference = np.tile([25.0, 0, 0, 4, 4, 0, 8], (columns, 1))
+    reference[:, X], reference[:, Y] = 30 * (np.arange(columns) % side), 30 * (np.arange(columns) // side)
+    settings = SimpleNamespace(drift_columns=None)
+    from_centre = reference[:, [X, Y]] - reference[:, [X, Y]].mean(axis=0)
+    return SimpleNamespace(reference=reference, from_centre=from_centre, centre=0, refined_by=10, settings=settings)
+
+
+@pytest.mark.parametrize("frames", [6, 12, 24])
+def test_columns_that_scatter_or_hop_by_themselves_are_no_part_that_slips(frames):
+    """At most one of 20 crystals of 100 columns; a third of them hops by four standard errors, in half of the draws."""
+    chance, job, slipped = np.random.default_rng(frames), still(100), 0
+    for draw in range(20):
+        away = chance.normal(0, 0.1, (frames, 100, 2))
+        if draw % 2:
+            away[:, ::3] += 0.4 * np.repeat(chance.normal(0, 1, (-(-frames // 6), 34, 2)), 6, axis=0)[:frames]
+        slipped += judge(Fits(away, job), frames, frames, job) is not None
+    assert slipped <= 1
+
+
+def test_a_part_that_slips_is_told_from_columns_that_hop():
+    chance, job = np.random.default_rng(3), still(100)
+    away = chance.normal(0, 0.1, (12, 100, 2))
+    away[:6, ::3] += 0.4 * chance.normal(0, 1, (34, 2))
+    slips = job.reference[:, X] > 170
+    away[6:, slips, 0] += 0.6
+    away[..., 0] -= 0.3 * (np.arange(12) >= 6)[:, None]  # a drift that follows both parts
+    crystal = judge(Fits(away, job), 12, 12, job)
+    assert crystal.reference[slips].mean() < 0.1  # hoppers that went where the others are
+    assert crystal.reference[~slips].mean() > 0.6
+
+
+def test_a_crystal_that_is_seen_in_three_frames_is_left_as_it_was_fitted():
+    away = np.random.default_rng(4).normal(0, 0.1, (24, 30, 2))
+    away[3:] = np.nan
+    assert judge(Fits(away, still(30)), 24, 24, still(30)) is None
+
+
+def test_one_column_that_is_named_stands_still_with_and_without_a_measured_drift(npy, tmp_path):
+    crystal = Crystal()
+    settings = FitSettings(drift_columns=(8,))
+    path = npy(crystal.movie())
+    movie = open_movie(convert(path, tmp_path / "movie.zarr", settings=ConvertSettings(shard_mb=1, tile_px=64)))
+    job = prepare(movie, crystal.columns(), crystal.drift_dataset().assign_attrs(method="none"), settings)
+    fit_movie(movie, job, tmp_path / "results.zarr")
+    tracks = open_results(tmp_path / "results.zarr").load()
+    seen = tracks["fit"].sel(parameter=["x", "y"]).to_numpy()[:, 7]
+    assert np.nanmax(np.abs(seen - job.reference[7, [X, Y]])) < 1e-6
+    assert "not_reference" not in metadata.attributes(tmp_path / "results.zarr")
+    lazy = fit_columns(movie, crystal.columns(), crystal.drift_dataset(), settings)
+    np.testing.assert_allclose(lazy["fit"].sel(parameter=["x", "y"]).to_numpy()[:, 7], seen, atol=1e-6)
 
 
 @pytest.mark.parametrize(("settings", "words"), [({"drift_columns": (1, 999)}, "999"), ({"drift_columns": ()}, "none")])

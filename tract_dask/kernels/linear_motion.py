@@ -22,6 +22,12 @@ UNITS = ("rad", "1", "1", "1")
 _GENERATORS = np.array([[[0, -1], [1, 0]], [[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]]], np.float64)
 """(4, 2, 2) by which (x, y) is multiplied."""
 
+_FEWEST = 10
+"""With fewer columns the spread of what is left does not tell their errors."""
+
+_THIN = 1e-4
+"""Determinant of columns' covariance over its squared trace: with less they lie on a line, as thin as 1 to 100."""
+
 _ROUNDS = 20
 _BIWEIGHT = 6.0
 """Median deviations at which a column no longer counts."""
@@ -88,7 +94,7 @@ def estimate(away: Floats, places: Floats, weight: Floats) -> tuple[Floats, Floa
     Notes
     -----
     Weighted least squares of a shift and a matrix, one axis at a time, for both have the same normal equations. Errors
-    are from the spread of what is left. NaN for frames with fewer than four columns, and where all lie on a line.
+    are from the spread of what is left. NaN for frames with fewer than ten columns, and where all lie on a line.
     """
     ones = np.ones(len(places))
     design = np.column_stack([ones, places])  # (n, 3)
@@ -97,7 +103,10 @@ def estimate(away: Floats, places: Floats, weight: Floats) -> tuple[Floats, Floa
     count = (weight > 0).sum(axis=1)
     scale = np.sqrt(np.maximum(np.einsum("fii->fi", normal), 1e-300))
     scaled = normal / scale[:, :, None] / scale[:, None, :]
-    usable = (count > 3) & (np.linalg.det(scaled) > 1e-9)
+    total = np.maximum(normal[:, 0, 0], 1e-300)[:, None]
+    middle = normal[:, 0, 1:] / total
+    spread_out = normal[:, 1:, 1:] / total[..., None] - middle[:, :, None] * middle[:, None, :]
+    usable = (count >= _FEWEST) & (np.linalg.det(spread_out) > _THIN * np.einsum("fii->f", spread_out) ** 2)
     inverse = np.full_like(normal, np.nan)
     inverse[usable] = np.linalg.inv(scaled[usable]) / scale[usable, :, None] / scale[usable, None, :]
     rows, variances = [], []
@@ -142,12 +151,12 @@ def fit(
     Notes
     -----
     Gauss-Newton steps of least squares, weighted by 1 / expected^2 times Tukey's biweight of the distance, so that
-    columns that move by themselves do not count. Frames with fewer columns than unknowns keep zeros.
+    columns that move by themselves do not count. A shift alone takes one column; frames with too few keep zeros.
     """
     frames, columns = len(seen), len(places)
     shift, motion = np.zeros((frames, 2)), np.zeros((frames, 4))
     unknowns = 2 + len(chosen)
-    enough = 2 * good.sum(axis=1) > unknowns + 2
+    enough = 2 * good.sum(axis=1) > (unknowns + 2 if chosen else 0)
     seen = np.where(good[..., None], seen, 0.0)
     slopes = np.zeros((frames, columns, 2, unknowns))
     slopes[:, :, 0, 0] = slopes[:, :, 1, 1] = 1

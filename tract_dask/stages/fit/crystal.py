@@ -88,14 +88,13 @@ class Crystal:
     @classmethod
     def of(cls, motions: tuple[int, ...], reference: Bools, job: Job) -> Crystal:
         """Return it for the columns of a job."""
-        height = np.abs(job.reference[:, AMPLITUDE]) + 1e-12
-        expected = np.sqrt(np.abs(job.reference[:, BACKGROUND]) + height / 2) / height
-        return cls(motions, reference, job.centre, job.from_centre, expected)
+        return cls(motions, reference, job.centre, job.from_centre, errors_of(job.reference))
 
     def told(self, job: Job) -> dict[str, Any]:
         """Return what the store of results says of it."""
         moving = job.columns["column_id"].to_numpy()[~self.reference].tolist()
-        return {"motions_undone": [linear_motion.NAMES[k] for k in self.motions], "not_reference": moving}
+        found = {} if job.settings.drift_columns is not None else {"not_reference": moving}
+        return {"motions_undone": [linear_motion.NAMES[k] for k in self.motions], **found}
 
     def put_right(self, values: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Return :data:`CHANGED` of some frames from their fits as :func:`.measure.measure` returns them."""
@@ -117,6 +116,12 @@ class Crystal:
         return {"fit": fit, "centroid": centroid, "drift": drift + shift[:, ::-1], "motion": motion}
 
 
+def errors_of(columns: Floats) -> Floats:
+    """Return the errors of positions of columns (n, 7), up to a factor that all share."""
+    height = np.abs(columns[:, AMPLITUDE]) + 1e-12
+    return np.asarray(np.sqrt(np.abs(columns[:, BACKGROUND]) + height / 2) / height)
+
+
 def judged(journal: Journal, path: Path, job: Job) -> Crystal | None:
     """Return how positions of the store at ``path`` are put right, from the parts of its journal; see :func:`judge`.
 
@@ -134,6 +139,13 @@ def judged(journal: Journal, path: Path, job: Job) -> Crystal | None:
         raise DamagedPartError(error.what, error.where, got=error.got, remedy=AGAIN) from error
 
 
+def named(job: Job) -> Crystal | None:
+    """Return how positions are put right by the columns that the settings name; None where they name none."""
+    if job.settings.drift_columns is None:
+        return None
+    return Crystal.of((), np.isin(job.columns["column_id"], job.settings.drift_columns), job)
+
+
 def judge(parts: Parts, frames: int, step: int, job: Job) -> Crystal | None:
     """Return how positions of a movie are put right; None where they stay as they are.
 
@@ -142,12 +154,8 @@ def judge(parts: Parts, frames: int, step: int, job: Job) -> Crystal | None:
     parts
         All fits, of so many ``frames`` in shards of ``step``.
     """
-    if job.refined_by is None:
-        return None
-    if job.settings.drift_columns is not None:
-        return Crystal.of((), np.isin(job.columns["column_id"], job.settings.drift_columns), job)
-    if frames < _FEWEST_FRAMES:
-        return None
+    if (chosen := named(job)) or job.refined_by is None or frames < _FEWEST_FRAMES:
+        return chosen
     measured, stderr = (_of_all(parts, name, frames, step) for name in ("motion_measured", "motion_stderr"))
     seen = _Seen.of(parts, frames, step, job)
     if seen is None:
@@ -199,10 +207,14 @@ class _Seen:
         away = np.concatenate(places) - job.reference[:, [X, Y]]
         number = np.concatenate(numbers)
         epochs = np.array_split(np.arange(len(number)), min(_EPOCHS, max(2, len(number) // 4)))
-        return cls._averaged(away, epochs)
+        return cls.averaged(away, epochs, errors_of(job.reference))
 
     @classmethod
-    def _averaged(cls, away: Floats, epochs: list[NDArray[np.int64]]) -> _Seen | None:
+    def averaged(cls, away: Floats, epochs: list[NDArray[np.int64]], expected: Floats) -> _Seen | None:
+        """Return it from displacements (frames, columns, 2), with errors (columns,) that are known up to a factor.
+
+        A few frames show a scatter that is much too small by chance, so none is taken to be smaller than expected.
+        """
         seen = np.isfinite(away[..., 0])
         count = np.array([seen[part].sum(axis=0) for part in epochs])
         total = np.array([np.nansum(away[part], axis=0) for part in epochs])
@@ -214,7 +226,8 @@ class _Seen:
         few = ~(free >= 2)
         if few.all():
             return None
-        single[few] = np.nanmedian(single[~few])
+        usual = np.median(single[~few] / expected[~few] ** 2)
+        single = np.fmax(single, usual * expected**2)
         mean[:, few] = np.nan
         variance = single / np.maximum(count, 1)
         weight = np.where(np.isfinite(mean[..., 0]), count, 0)
@@ -275,6 +288,8 @@ def _halves(seen: _Seen, body: Bools, price: float) -> list[Bools]:
 
     The first cut is along the strongest common motion; then columns go to the half that they move with, some times.
     """
+    if body.sum() < 2 * _FEWEST_COLUMNS:
+        return []
     mean, _ = _mean_of(seen, body)
     left = np.nan_to_num((seen.mean - mean[:, None])[:, body] / np.sqrt(seen.variance[:, body])[..., None])
     _, _, scores = np.linalg.svd(np.swapaxes(left, 1, 2).reshape(-1, left.shape[1]), full_matrices=False)
@@ -289,8 +304,11 @@ def _halves(seen: _Seen, body: Bools, price: float) -> list[Bools]:
         if (new == first).all():
             break
         first = new
-    gain = float((_away(seen, body) - np.minimum(one, other))[body].sum())
-    worth = price * 2 * (len(seen.mean) - 1) + body.sum() * np.log(2)
+    alone = price * _squares(seen.mean, seen)[1]  # what a column costs that moves by itself
+    gain = float((np.minimum(_away(seen, body), alone) - np.minimum(np.minimum(one, other), alone))[body].sum())
+    numbers, columns = 2 * (len(seen.mean) - 1), body.sum()
+    by_chance = 2 / np.pi * (1 + np.sqrt(numbers / columns)) ** 2  # a column's gain by the best cut through noise
+    worth = price * numbers + columns * max(np.log(2), by_chance)
     return [first, body & ~first] if gain > worth else []
 
 

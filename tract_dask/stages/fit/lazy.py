@@ -8,6 +8,7 @@ from ...settings.run import FitSettings
 from ...store import results, schema
 from ...store.movie import Movie
 from ...store.source_pixels import with_source_coordinates
+from .crystal import named
 from .empty import calibrated
 from .job import calibration, prepare
 from .measure import Values, measure
@@ -53,11 +54,13 @@ def fit_columns(
     from dask import delayed
 
     job = calibrated(prepare(movie, columns, drift, settings or FitSettings(), summed=summed))
+    still = named(job)
     sizes = {"frame": movie.n_frames, "column_id": len(job.reference)} | schema.SIZES
     fitted = {name: of for name, of in schema.RESULTS.items() if name not in ("time", "drift_measured")}
 
     def fit_shard(index: int) -> Values:
         values = measure(movie, movie.shards[index], job)
+        values |= still.put_right(values) if still else {}
         return {name: values[name].astype(of.dtype) for name, of in fitted.items()}
 
     shards = [delayed(fit_shard, pure=False)(index) for index in range(len(movie.shards))]
