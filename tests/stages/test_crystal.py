@@ -13,6 +13,7 @@ from tract_dask.errors import SettingsError
 from tract_dask.kernels import linear_motion
 from tract_dask.kernels.gaussian.parameters import X, Y
 from tract_dask.settings import ConvertSettings, FitSettings
+from tract_dask.stages.fit.crystal import Crystal as PutRight
 from tract_dask.stages.fit.crystal import judge
 from tract_dask.stages.fit.job import prepare
 from tract_dask.stages.fit.stage import fit_movie
@@ -181,6 +182,17 @@ def test_one_column_that_is_named_stands_still_with_and_without_a_measured_drift
     assert "not_reference" not in metadata.attributes(tmp_path / "results.zarr")
     lazy = fit_columns(movie, crystal.columns(), crystal.drift_dataset(), settings)
     np.testing.assert_allclose(lazy["fit"].sel(parameter=["x", "y"]).to_numpy()[:, 7], seen, atol=1e-6)
+
+
+def test_a_frame_without_the_columns_that_stand_still_is_lost():
+    job = still(100)
+    values = {"fit": np.tile(job.reference, (2, 1, 1)), "centroid": np.zeros((2, 100, 2)), "drift": np.zeros((2, 2))}
+    values["status"] = np.zeros((2, 100), np.uint8)
+    values["status"][1, :98] = Status.NOT_CONVERGED
+    turning = PutRight((0,), np.ones(100, bool), np.zeros(2), job.reference[:, [X, Y]], np.ones(100))
+    lost = turning.put_right(values)["status"] & Status.LOST_FRAME
+    assert not lost[0].any()
+    assert lost[1].all()
 
 
 @pytest.mark.parametrize(("settings", "words"), [({"drift_columns": (1, 999)}, "999"), ({"drift_columns": ()}, "none")])

@@ -130,6 +130,11 @@ def _sums(values: Floats, factors: Floats) -> Floats:
     return np.stack([(values * factor).sum(axis=1) for factor in factors.T], axis=1)
 
 
+def fewest(chosen: Sequence[int]) -> int:
+    """Return how many columns :func:`fit` takes for a shift and these numbers of a motion."""
+    return 3 + len(chosen) // 2 if chosen else 1
+
+
 def fit(
     seen: Floats, places: Floats, expected: Floats, good: NDArray[np.bool_], chosen: Sequence[int]
 ) -> tuple[Floats, Floats]:
@@ -156,7 +161,7 @@ def fit(
     frames, columns = len(seen), len(places)
     shift, motion = np.zeros((frames, 2)), np.zeros((frames, 4))
     unknowns = 2 + len(chosen)
-    enough = 2 * good.sum(axis=1) > (unknowns + 2 if chosen else 0)
+    enough = good.sum(axis=1) >= fewest(chosen)
     seen = np.where(good[..., None], seen, 0.0)
     slopes = np.zeros((frames, columns, 2, unknowns))
     slopes[:, :, 0, 0] = slopes[:, :, 1, 1] = 1

@@ -27,7 +27,7 @@ from .job import Job
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-CHANGED = ("fit", "centroid", "drift", "motion")
+CHANGED = ("fit", "centroid", "drift", "motion", "status")
 """The variables that are put right."""
 
 _EPOCHS = 16
@@ -97,7 +97,10 @@ class Crystal:
         return {"motions_undone": [linear_motion.NAMES[k] for k in self.motions], **found}
 
     def put_right(self, values: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Return :data:`CHANGED` of some frames from their fits as :func:`.measure.measure` returns them."""
+        """Return :data:`CHANGED` of some frames from their fits as :func:`.measure.measure` returns them.
+
+        Frames that show too few columns of the reference cannot be put right: they are lost frames.
+        """
         step = max(1, _FITS_AT_ONCE // len(self.reference))
         starts = range(0, len(values["fit"]), step)
         parts = [self._put_right({name: of[k : k + step] for name, of in values.items()}) for k in starts]
@@ -113,7 +116,11 @@ class Crystal:
             away = array[..., order] - self.centre - shift[:, None]
             array[..., order] = self.centre + linear_motion.moved(away, back)
         fit[..., THETA] += motion[:, :1]
-        return {"fit": fit, "centroid": centroid, "drift": drift + shift[:, ::-1], "motion": motion}
+        few = (good.sum(axis=1) < linear_motion.fewest(self.motions)) & ~(
+            values["status"] & schema.Status.BAD_FRAME
+        ).any(axis=1)
+        status = values["status"] | np.where(few, schema.Status.LOST_FRAME, 0).astype(np.uint8)[:, None]
+        return {"fit": fit, "centroid": centroid, "drift": drift + shift[:, ::-1], "motion": motion, "status": status}
 
 
 def errors_of(columns: Floats) -> Floats:

@@ -121,7 +121,7 @@ def _put_right(job: _Joining, parts: Parts, shards: range) -> dict[str, dict[int
     sizes = schema.SIZES | {"column_id": len(job.crystal.reference)}
     for shard in shards:
         frames, values = min(job.step, job.n_frames - shard * job.step), {}
-        for name in (*CHANGED, "status"):
+        for name in CHANGED:
             checked(parts, shard, name)
             variable = schema.RESULTS[name]
             whole = np.empty((job.step, *(sizes[dim] for dim in variable.dims[1:])), variable.dtype)
