@@ -266,6 +266,14 @@ def test_a_table_of_tracks_without_a_pixel_size_has_no_picometres(store):
     assert "x_pm" not in table(tracks)
 
 
+def test_a_table_has_the_motion_that_was_undone(store):
+    tracks = open_results(store).load()
+    written = table(tracks)
+    rotation = tracks["motion"].sel(motion_kind="rotation").to_numpy()
+    np.testing.assert_array_equal(written["motion_rotation"], np.repeat(rotation, N_COLUMNS))
+    assert not [name for name in written if name.startswith(("motion_measured", "motion_stderr"))]
+
+
 def test_the_command(store, tmp_path):
     def tract(*arguments):
         return CliRunner().invoke(cli.main, ["export", *map(str, arguments)])

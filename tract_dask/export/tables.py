@@ -19,6 +19,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import DestinationError, InputError, SettingsError
+from ..kernels import linear_motion
 from ..kernels.gaussian import parameters
 from ..kernels.gaussian.intensity import Floats
 from ..store import disk, files, metadata, results, schema
@@ -89,6 +90,10 @@ def open_tracks(source: str | Path | xr.Dataset) -> xr.Dataset:
     return in_source_pixels(results.open_results(inside if inside.exists() else source))
 
 
+_LEFT_OUT = ("presence_vacuum", "motion_measured", "motion_stderr")
+"""Variables over the frames that are in no table."""
+
+
 def table(tracks: xr.Dataset) -> pd.DataFrame:
     """Return tracks as a table with a row for each fit, in the order of the frames.
 
@@ -103,6 +108,7 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
         ``frame``, ``time``, ``column_id``, ``kind``, ``x_pm`` and ``y_pm`` (where the size of a pixel is known), then
         the variables of the results under their names: the parameters of the fit, ``x_stderr`` for the standard error
         of x, ``drift_y`` for the y axis of drift; ``accepted`` tells which fits are. Units are those of the results.
+        What is measured in vacuum, and motions that are not undone, are left out.
     """
     tracks = tracks.compute()
     n_frames, n_columns = tracks.sizes["frame"], tracks.sizes["column_id"]
@@ -117,7 +123,7 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
         columns[f"{axis}_pm"] = scale * tracks["fit"].sel(parameter=axis).to_numpy().ravel()
     said = [str(name) for name, of in tracks.coords.items() if of.dims == ("frame",) and name not in columns]
     for name in [*said, *map(str, tracks.data_vars)]:
-        if name not in columns and "frame" in tracks[name].dims and "place" not in tracks[name].dims:
+        if name not in columns and name not in _LEFT_OUT and "frame" in tracks[name].dims:
             columns |= _flat(name, tracks[name], n_columns)
     columns["accepted"] = ((tracks["status"] & np.uint8(REJECTED)) == 0).to_numpy().ravel()
     return pd.DataFrame(columns)
@@ -126,7 +132,7 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
 def _flat(name: str, values: xr.DataArray, n_columns: int) -> dict[str, NDArray[Any]]:
     """Return one variable as columns of a table."""
     last = values.dims[-1]
-    if last in ("parameter", "axis"):
+    if last in ("parameter", "axis", "motion_kind"):
         label = {"fit": "{}", "stderr": "{}_stderr"}.get(name, f"{name}_{{}}")
         return {
             key: column
@@ -260,7 +266,7 @@ def _units(tracks: xr.Dataset) -> dict[str, str]:
     for name, values in tracks.data_vars.items():
         unit = str(values.attrs.get("units", ""))
         units |= {str(name): unit} | {f"{name}_{axis}": unit for axis in schema.AXES if "axis" in values.dims}
-    return units
+    return units | {f"motion_{kind}": unit for kind, unit in zip(linear_motion.NAMES, linear_motion.UNITS, strict=True)}
 
 
 def _plain_attributes(tracks: xr.Dataset) -> dict[str, Any]:

@@ -67,4 +67,7 @@ def in_source_pixels(tracks: xr.Dataset) -> xr.Dataset:
     kept = {name: value for name, value in tracks.attrs.items() if not name.startswith("source_")}
     seen = tracks.assign(with_attributes).assign_coords(frame=frames)
     seen.attrs = kept | {"pixel_size_pm": pixel and pixel / side}
+    if "motion_centre" in kept:
+        centre = zip(kept["motion_centre"], ("x", "y"), strict=True)
+        seen.attrs["motion_centre"] = [float(side * place + origin[axis]) for place, axis in centre]
     return seen
