@@ -849,7 +849,7 @@ def test_pairs_whose_errors_are_as_large_as_their_distance_are_told(tmp_path):
 
 
 def test_a_crystal_that_turned_and_one_that_slipped_are_told(tmp_path):
-    for name in ("still", "turned", "slipped"):
+    for name in ("still", "turned", "slipped", "both"):
         (tmp_path / name).mkdir()
     assert not {"crystal_motion", "moving_columns"} & {
         finding.name for finding in findings(survey(Run(tmp_path / "still").write(), []))
@@ -861,3 +861,5 @@ def test_a_crystal_that_turned_and_one_that_slipped_are_told(tmp_path):
     slipped = Run(tmp_path / "slipped", motions_undone=[], not_reference=[1, 2, 3])
     found = {finding.name: finding for finding in findings(survey(slipped.write(), []))}
     assert found["moving_columns"].text.startswith("3 of ")
+    both = Run(tmp_path / "both", motions_undone=["rotation"], not_reference=[1, 2, 3, 4, 5], motion_centre=[0.0, 0.0])
+    assert {"crystal_motion", "moving_columns"} <= {finding.name for finding in findings(survey(both.write(), []))}

@@ -11,6 +11,8 @@ from .survey import Survey
 
 BLURRED = 0.25
 """Share of the columns' sigma by which a motion may carry the farthest ones about in the summed image."""
+SOME = 0.1
+"""Share of the columns that must move by themselves, where the crystal turns as well, to be told."""
 MANY = 0.5
 """Share of the columns that must stand still for the others to be those that move."""
 
@@ -18,7 +20,7 @@ MANY = 0.5
 def slip_words(run: Survey) -> dict[str, Any] | None:
     """Return what there is to say of columns that moved against the others; None where a single one did, or none."""
     moving, number = run.about.get("not_reference") or (), run.tracks.sizes["column_id"]
-    if run.about.get("motions_undone") or len(moving) < 2:
+    if len(moving) < 2 or (run.about.get("motions_undone") and len(moving) < SOME * number):
         return None
     few = len(moving) > (1 - MANY) * number
     text = (

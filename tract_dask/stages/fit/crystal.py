@@ -33,7 +33,7 @@ CHANGED = ("fit", "centroid", "drift", "motion", "status")
 _EPOCHS = 16
 """The movie is looked at in so many parts, over which positions are averaged."""
 
-_MOST_SHARDS, _FEWEST_SHARDS, _MOST_FITS = 64, 4, 8_000_000
+_MOST_SHARDS, _FEWEST_SHARDS, _MOST_FITS = 64, 4, 3_000_000
 """So many shards tell of the whole movie; fewer where they hold more fits than this."""
 
 _FITS_AT_ONCE = 1 << 19
