@@ -114,7 +114,7 @@ def estimate(away: Floats, places: Floats, weight: Floats) -> tuple[Floats, Floa
         values = np.where(weight > 0, away[..., axis], 0.0)
         right = _sums(weight * values, design)
         row = np.einsum("fij,fj->fi", inverse, right)
-        left = np.einsum("fn,fn,fn->f", weight, values, values) - np.einsum("fi,fi->f", row, right)
+        left = (weight * values * values).sum(axis=1) - np.einsum("fi,fi->f", row, right)
         rows.append(row[:, 1:])
         spread = np.maximum(left, 0) / np.maximum(count - 3, 1)
         variances.append(spread[:, None] * np.einsum("fii->fi", inverse)[:, 1:])
@@ -165,7 +165,6 @@ def fit(
     seen = np.where(good[..., None], seen, 0.0)
     slopes = np.zeros((frames, columns, 2, unknowns))
     slopes[:, :, 0, 0] = slopes[:, :, 1, 1] = 1
-    step = np.full((frames, unknowns), np.inf)
     for _ in range(_ROUNDS):
         turned = moved(places, motion)
         left = seen - turned - shift[:, None]
@@ -178,7 +177,7 @@ def fit(
         weighted = flat * doubled[..., None]
         normal = np.swapaxes(weighted, 1, 2) @ flat
         right = np.einsum("fmk,fm->fk", weighted, left.reshape(frames, -1))
-        step = np.zeros_like(step)
+        step = np.zeros((frames, unknowns))
         step[enough] = _solve(normal[enough], right[enough])
         shift += step[:, :2]
         motion[:, list(chosen)] += step[:, 2:]

@@ -48,8 +48,8 @@ def write(run: Path, shard: Shard, values: dict[str, NDArray[Any]], frames_per_s
 
     Pieces have the frames of a whole shard; those of the last shard are filled up.
     """
-    pieces = [piece for name in SHARDED for piece in _piece(name, values[name], frames_per_shard)]
-    lengths = np.array([*map(len, pieces)]).reshape(-1, 2).sum(axis=1)
+    pieces = [piece(name, values[name], frames_per_shard) for name in SHARDED]
+    lengths = [*map(len, pieces)]
     tail = np.array([shard.index, *lengths], "<u8").tobytes()
     with disk_errors(run):
         disk.append(own_file(run, GROWING), b"".join([*pieces, tail, checksum(tail)]))
@@ -57,15 +57,11 @@ def write(run: Path, shard: Shard, values: dict[str, NDArray[Any]], frames_per_s
 
 def piece(name: str, array: NDArray[Any], frames: int) -> bytes:
     """Return the values of a variable for the frames of one shard as a piece, with the frames of a whole shard."""
-    return b"".join(_piece(name, array, frames))
-
-
-def _piece(name: str, array: NDArray[Any], frames: int) -> tuple[bytes, bytes]:
     variable = schema.RESULTS[name]
     chunk = np.full((frames, *array.shape[1:]), variable.fill, variable.dtype)
     chunk[: len(array)] = array
     data = bytes(encode(chunk, CODEC))
-    return data, checksum(data)
+    return data + checksum(data)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..errors import SettingsError, StoreError
 from ..kernels.gaussian.parameters import PARAMETER_UNITS, PARAMETERS
 from ..kernels.linear_motion import NAMES as MOTIONS
+from ..kernels.linear_motion import UNITS as MOTION_UNITS
 
 CALIBRATION = ("pixel_size_pm", "frame_time_s", "dose", "gain", "offset")
 """What a movie's numbers mean: size of a pixel, time and dose of a frame, counts for one detector unit, and the
@@ -88,6 +89,10 @@ _FIT = ("frame", "column_id", "parameter")
 
 _COLUMN = ("frame", "column_id")
 
+_MOTION = ("frame", "motion_kind")
+
+_MOTION_UNITS = ", ".join(MOTION_UNITS)
+
 _NAN = float("nan")
 
 RESULTS = _declare(
@@ -134,14 +139,21 @@ RESULTS = _declare(
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
     Variable(
         "motion",
-        ("frame", "motion_kind"),
+        _MOTION,
         "float64",
-        "rad, 1, 1, 1",
+        _MOTION_UNITS,
         "Rotation from x towards y, magnification and shears of all columns, which positions are freed from",
         0.0,
     ),
-    Variable("motion_measured", ("frame", "motion_kind"), "float64", "rad, 1, 1, 1", "The same, of every frame", _NAN),
-    Variable("motion_stderr", ("frame", "motion_kind"), "float64", "rad, 1, 1, 1", "Standard errors of these", _NAN),
+    Variable(
+        "motion_measured",
+        _MOTION,
+        "float64",
+        _MOTION_UNITS,
+        "The same, of every frame",
+        _NAN,
+    ),
+    Variable("motion_stderr", _MOTION, "float64", _MOTION_UNITS, "Standard errors of these", _NAN),
     Variable("drift_measured", ("frame", "axis"), "float64", "px", "The same, before the columns refined it", _NAN),
     Variable("noise", _COLUMN, "float64", "counts", "Noise of a pixel at the column's level, after the filter", _NAN),
     Variable(

@@ -97,13 +97,19 @@ def check_fits(movie: FrameSource, settings: ConvertSettings, references: Pixels
     if references.dark is not None:
         place, dark = str(settings.dark), references.dark.astype(np.float64)
         _check_level(place, mean - dark)
-        summed = lambda image: in_part(image, movie).sum(axis=2)  # noqa: E731
+
+        def summed(image: Image) -> Image:
+            return np.asarray(in_part(image, movie).sum(axis=2))
+
         _check_dark(movie, _Reference("the dark image", place, mean, dark, summed, added_likeness))
         mean = mean - dark
     if references.gain is not None:
         place, by = str(settings.gain_reference), settings.gain_reference_by
         known = 1 / references.gain.astype(np.float64)
-        averaged = lambda image: in_part(sensitivity(image, place, by), movie).mean(axis=2)  # noqa: E731
+
+        def averaged(image: Image) -> Image:
+            return np.asarray(in_part(sensitivity(image, place, by), movie).mean(axis=2))
+
         _check_gain(movie, _Reference("the gain reference", place, mean, known, averaged, likeness), by)
 
 

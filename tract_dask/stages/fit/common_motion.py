@@ -45,8 +45,7 @@ def common_motion(estimates: Floats, status: NDArray[np.uint8], drift: Floats, j
     if job.refined_by is None:
         return found
     away = estimates[..., [Y, X]] - drift[:, None] - job.reference[:, [Y, X]]
-    expected = np.sqrt(np.abs(job.reference[:, BACKGROUND]) + np.abs(job.reference[:, AMPLITUDE]) / 2)
-    expected /= np.abs(job.reference[:, AMPLITUDE]) + 1e-12
+    expected = errors_of(job.reference)
     good = (status & REJECTED) == 0
     enough = good.sum(axis=1) >= job.refined_by
     if enough.any():
@@ -57,6 +56,12 @@ def common_motion(estimates: Floats, status: NDArray[np.uint8], drift: Floats, j
             away[enough][..., ::-1], job.from_centre, weight.min(axis=1)
         )
     return found
+
+
+def errors_of(columns: Floats) -> Floats:
+    """Return the errors of positions of columns (n, 7), up to a factor that all share."""
+    height = np.abs(columns[:, AMPLITUDE])
+    return np.asarray(np.sqrt(np.abs(columns[:, BACKGROUND]) + height / 2) / (height + 1e-12))
 
 
 def _biweight(values: Floats, expected: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from ...errors import StoreError
 from ...kernels import linear_motion
-from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, THETA, X, Y
+from ...kernels.gaussian.parameters import THETA, X, Y
 from ...store import schema
 from ...store.journal import Journal
 from ...store.parts import AGAIN, DamagedPartError, Parts, layout
+from .common_motion import errors_of
 from .job import Job
 
 Floats = NDArray[np.float64]
@@ -111,22 +112,14 @@ class Crystal:
         fit, centroid, drift = values["fit"].copy(), values["centroid"].copy(), values["drift"].copy()
         seen = fit[..., [X, Y]] - self.centre
         shift, motion = linear_motion.fit(seen, self.places, self.expected, good, self.motions)
-        back = -motion
         for array, order in ((fit, [X, Y]), (centroid, [1, 0])):
             away = array[..., order] - self.centre - shift[:, None]
-            array[..., order] = self.centre + linear_motion.moved(away, back)
+            array[..., order] = self.centre + linear_motion.moved(away, -motion)
         fit[..., THETA] += motion[:, :1]
-        few = (good.sum(axis=1) < linear_motion.fewest(self.motions)) & ~(
-            values["status"] & schema.Status.BAD_FRAME
-        ).any(axis=1)
+        bad = (values["status"] & schema.Status.BAD_FRAME).any(axis=1)
+        few = (good.sum(axis=1) < linear_motion.fewest(self.motions)) & ~bad
         status = values["status"] | np.where(few, schema.Status.LOST_FRAME, 0).astype(np.uint8)[:, None]
         return {"fit": fit, "centroid": centroid, "drift": drift + shift[:, ::-1], "motion": motion, "status": status}
-
-
-def errors_of(columns: Floats) -> Floats:
-    """Return the errors of positions of columns (n, 7), up to a factor that all share."""
-    height = np.abs(columns[:, AMPLITUDE]) + 1e-12
-    return np.asarray(np.sqrt(np.abs(columns[:, BACKGROUND]) + height / 2) / height)
 
 
 def judged(journal: Journal, path: Path, job: Job) -> Crystal | None:

@@ -98,12 +98,12 @@ def _fit_whole(
         try:
             crystal = judged(journal, path, job)
             join(path, journal, client, on_event, attempt, crystal)
-            return *found, crystal
+            break
         except DamagedPartError as error:
             if attempt == _ATTEMPTS - 1:
                 raise
             on_event(Warned(f"{error.what}: they are made again"))
-    raise AssertionError("unreachable")
+    return *found, crystal
 
 
 def _goes_on(path: Path, key: str, on_event: Sink) -> bool:
