@@ -84,7 +84,7 @@ def _with_missed(scene: Scene, seeds: Seeds, spacing: float, fits: Fits, columns
     variance = blur_variance(fits.blur_sigma_px)
     lattice = next(iter(scene.lattices.values()), None)
     cell = max(spacing, lattice.spacing) if lattice else spacing
-    image = Image(scene.counts, scene.valid, scene.noise, scene.sign)
+    image = Image(scene.counts, scene.known, scene.noise, scene.sign)
     found, parent = touching_columns(image, blurred(columns, -variance), cell / 2)
     n, added = len(columns), len(found) - len(columns)
     if not added:
