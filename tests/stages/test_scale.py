@@ -85,6 +85,11 @@ def assert_same(made: Made, plain: Made, factor: float = 1.0) -> None:
         np.testing.assert_allclose(made.tracks[name], plain.tracks[name], rtol=1e-3, atol=1e-2)
 
 
+def test_no_column_is_split_by_its_own_noise(plain):
+    """Counts vary most where columns are bright: that is no second column."""
+    assert plain.columns.sizes["column_id"] == len(Scene(**SCENE).place)
+
+
 @pytest.mark.parametrize("factor", [1e-30, 1e-16, 1e-7, 1e5, 1e6, 1e8, 1e15, 1e30])
 def test_frames_times_a_factor_give_the_same_tracks(make, frames, plain, factor):
     assert_same(make((frames * factor).astype(np.float32)), plain, factor)

@@ -270,7 +270,7 @@ class _Noise(NamedTuple):
 
 def _noise(trials: list[_Trial], tried: list[_Tried], least: float) -> _Noise:
     """Return what most groups leave after one more column: noise, and what no sum of Gaussians describes."""
-    left, shared = [], []
+    left, shared, there = [], [], []
     for trial, one in zip(trials, tried, strict=True):
         number = trial.masks.sum(axis=(1, 2))
         left += (one.after / np.maximum(number - 4 * one.fits.shape[1], 1)).tolist()
@@ -278,17 +278,17 @@ def _noise(trials: list[_Trial], tried: list[_Tried], least: float) -> _Noise:
         for window, mask, group in zip(trial.windows, trial.masks, one.fits, strict=True):
             shapes = group.copy()
             shapes[:, BACKGROUND] = 0
-            residual = np.where(
-                mask, window - evaluate(shapes, across, down[:, None]).sum(axis=0) - group[0, BACKGROUND], 0
-            )
+            columns = evaluate(shapes, across, down[:, None]).sum(axis=0) * mask
+            residual = np.where(mask, window - columns - group[0, BACKGROUND], 0)
             power = float((residual**2).sum())
+            seen = float((columns**2 * residual**2).sum() / max(float((columns**2).sum()), 1e-300))
             steps = float((residual[1:] * residual[:-1]).sum()), float((residual[:, 1:] * residual[:, :-1]).sum())
-            shared.append(
-                float(np.prod([(1 + r) / (1 - r) for r in np.clip(np.array(steps) / max(power, 1e-300), 0, 0.7)]))
-            )
+            along = np.clip(np.array(steps) / max(power, 1e-300), 0, 0.7)
+            shared.append(float(np.prod((1 + along) / (1 - along))))
+            there.append(seen * mask.sum() / max(power, 1e-300))
     if not left:
         return _Noise(least**2, 1.0)
-    return _Noise(max(least**2, float(np.median(left))), float(np.median(shared)))
+    return _Noise(max(least**2, float(np.median(left))), float(np.median(shared)) * max(1.0, float(np.median(there))))
 
 
 def _matched(group: Floats, members: Floats) -> list[int]:
