@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import tract_dask as td
+from tract_dask.kernels.gaussian.intensity import INTENSITY_SCALE
 from tract_dask.progress import Event, to_record
 from tract_dask.report.findings import findings
 from tract_dask.report.survey import survey
@@ -185,6 +186,10 @@ class Score:
         Standard deviation of a coordinate about its column's mean error, px.
     bias_in_errors
         Root mean square of the columns' mean errors over the stated errors of these means; 1 is right.
+    intensity
+        Median over the columns of the mean intensity over the true one; 1 is right.
+    intensity_in_errors
+        By how many stated errors (median over the columns) of a column's mean intensity the median is off.
     pull
         Root mean square of error over stated error; 1 is right.
     unstated
@@ -204,6 +209,8 @@ class Score:
     accepted_absent: float
     scatter: float
     bias_in_errors: float
+    intensity: float
+    intensity_in_errors: float
 
     def __str__(self) -> str:
         absent = "" if np.isnan(self.accepted_absent) else f"; accepted while absent {self.accepted_absent:.1%}"
@@ -214,8 +221,13 @@ class Score:
         )
 
 
-def score(tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: float = 6.0) -> Score:
-    """Compare tracks with the truth; columns within ``border`` px of the edge are not judged."""
+def score(
+    tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: float = 6.0, unit: float = 1.0
+) -> Score:
+    """Compare tracks with the truth; columns within ``border`` px of the edge are not judged.
+
+    ``unit``: detector units an electron.
+    """
     places = placed(tracks)
     stated = tracks["stderr"].sel(parameter=["x", "y"]).transpose("frame", "column_id", "parameter").to_numpy()
     reference = np.stack([tracks["x_ref"].to_numpy(), tracks["y_ref"].to_numpy()], axis=1)
@@ -240,6 +252,7 @@ def score(tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: 
     of_mean = np.sqrt(np.where(counted, stated**2, 0).sum(axis=0)) / np.maximum(n, 1)
     deviations = np.where(judged, errors - mean, 0)[:, (n > 1).all(axis=1)]
     pulls = pulls[judged & np.isfinite(pulls)]
+    bright, bright_error = _intensities(tracks, scene, known, which[known], unit)
     return Score(
         found=len(known),
         wanted=int(inside.sum()),
@@ -252,7 +265,30 @@ def score(tracks: xr.Dataset, scene: Scene, *, border: float = 25.0, tolerance: 
         unstated=float(1 - pulls.size / max(1, judged.sum())),
         scatter=float(np.sqrt((deviations**2).sum() / max(1, (n[(n > 1).all(axis=1)] - 1).sum()))),
         bias_in_errors=float(np.sqrt(np.mean((mean / of_mean)[n > 0] ** 2))) if (n > 0).any() else np.nan,
+        intensity=bright,
+        intensity_in_errors=bright_error,
     )
+
+
+def _intensities(
+    tracks: xr.Dataset, scene: Scene, known: NDArray[np.int64], which: NDArray[np.int64], unit: float
+) -> tuple[float, float]:
+    """Return the columns' median mean intensity over the true one, and by how many stated errors it is off."""
+    true = INTENSITY_SCALE["paper"] * 2 * np.pi * scene.sigma**2 * unit * scene.amplitudes[:, known]
+    fits = td.accepted(tracks)
+    shares, errors = (
+        np.where(true == 0, np.nan, fits[name].transpose("frame", "column_id").to_numpy()[:, which])
+        / np.where(true == 0, np.nan, np.abs(true))
+        for name in ("intensity", "intensity_stderr")
+    )
+    judged = np.isfinite(shares) & np.isfinite(errors)
+    n = judged.sum(axis=0)
+    if not (n > 0).any():
+        return np.nan, np.nan
+    shares, errors = (np.where(judged, values, 0)[:, n > 0] for values in (shares * np.sign(true), errors))
+    n = n[n > 0]
+    found = float(np.median(shares.sum(axis=0) / n))
+    return found, abs(found - 1) / float(np.median(np.sqrt((errors**2).sum(axis=0)) / n))
 
 
 @contextmanager

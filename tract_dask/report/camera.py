@@ -14,8 +14,11 @@ OFF = 0.1
 """A gain, or an offset as a share of the usual level above it, that is off by more than this is worth a warning."""
 PATTERN = 0.02
 """A fixed pattern with a larger standard deviation, as a share of the level, is worth a warning."""
-FAINT = 0.03
-"""Square of the relative error of a single frame's intensity from which a warning is worth it."""
+FAINT, FAINT_ERRORS = 0.03, 0.1
+"""Square of the relative error of a single frame's intensity, by which intensities are too large, from which a warning
+is worth it where it is more than :data:`OFF_BY` stated errors of a column's mean; and by which errors of places are too
+small."""
+OFF_BY = 2.0
 _SURE = 5.0
 """Standard errors by which it must be off as well; columns that move by themselves leave more than one."""
 _READ_SHARE = 0.5
@@ -37,20 +40,22 @@ def pattern_words(camera: Camera) -> dict[str, Any] | None:
     return {"title": "The detector has a fixed pattern", "text": text, "remedy": remedy}
 
 
-def faint_words(faint: NDArray[np.float64]) -> dict[str, Any] | None:
+def faint_words(faint: NDArray[np.float64], accepted: NDArray[np.int64]) -> dict[str, Any] | None:
     """Return what there is to say of intensities that noise makes too large; None where that is little.
 
     A fit looks for its place, and finds that at which noise adds to the column: in units of its error s the amplitude A
-    is higher by s / A in the mean, so by the share (s / A)^2, of which ``faint`` (column) is the estimate.
+    is higher by s / A in the mean, so by the share (s / A)^2, of which ``faint`` (column) is the estimate. The mean of
+    ``accepted`` (column) n fits states a relative error of s / A / sqrt(n), and is off by sqrt(n) s / A such errors.
     """
-    known = faint[np.isfinite(faint)]
-    share = float(np.median(known)) if known.size else 0.0
-    if share <= FAINT:
+    known = np.isfinite(faint)
+    share = float(np.median(faint[known])) if known.any() else 0.0
+    errors = float(np.median(np.sqrt(faint[known] * accepted[known]))) if known.any() else 0.0
+    if share <= FAINT or (errors <= OFF_BY and share <= FAINT_ERRORS):
         return None
     text = (
         f"The intensity of a column in a single frame has an error of {np.sqrt(share):.0%} (median). Fits end where "
-        f"noise adds to a column: intensities and amplitudes are too large by about {share:.0%} in the mean, and the "
-        "errors of places are too small by about as much."
+        f"noise adds to a column: intensities and amplitudes are too large by about {share:.0%} in the mean, which is "
+        f"{errors:.1f} stated errors of a column's mean, and the errors of places are too small by about as much."
     )
     remedy = "Sum frames (rebin_frames). Columns that are equally bright can be compared with each other as well."
     return {"title": "Columns are faint in single frames", "text": text, "remedy": remedy}

@@ -324,7 +324,7 @@ def _why_no_errors(run: Survey) -> tuple[str, str]:
 def _errors(run: Survey) -> Iterator[Finding]:
     if run.accepted and not np.isfinite(run.columns["expected"]).any():
         yield Finding("no_errors", "No errors are known", *_why_no_errors(run), serious=False)
-    if words := faint_words(run.columns["faint"].to_numpy()):
+    if words := faint_words(run.columns["faint"].to_numpy(), run.columns["accepted"].to_numpy()):
         yield Finding("faint", **words)
     if np.isfinite(run.factor) and run.frames.sizes["frame"] > 2 and not FACTOR[0] <= run.factor <= FACTOR[1]:
         more = run.factor > 1

@@ -25,7 +25,7 @@ WINDOW = 21
 
 @dataclass(frozen=True)
 class Trial:
-    """A movie, its truth, and the settings to track it with."""
+    """A movie, its truth, and the settings to track it with; ``unit``: detector units an electron."""
 
     name: str
     scene: Scene
@@ -34,6 +34,7 @@ class Trial:
     columns: dict[str, Any] = field(default_factory=dict)
     tolerance: float = 6.0
     border: float = 25.0
+    unit: float = 1.0
 
     def cut(self, n_frames: int) -> Trial:
         """Return the same with no more than the first frames."""
@@ -93,10 +94,10 @@ def cameras() -> Iterator[Trial]:
     noise = np.random.default_rng(6).normal(0, 5, electrons.shape)
     units = np.clip(electrons * 7.3 + 100 + noise, 0, 65535).round().astype("u2")
     for fit in ({}, {"estimator": "poisson"}):
-        yield Trial(f"units of 7.3, offset 100 {fit}", scene, units, fit)
+        yield Trial(f"units of 7.3, offset 100 {fit}", scene, units, fit, unit=7.3)
     for blur in (0.5, 1.2, 2.0):
         blurred = np.stack([gaussian_filter(frame, blur, mode="wrap") for frame in electrons]) * 20
-        yield Trial(f"camera that blurs by {blur} px", scene, blurred.astype("f4"))
+        yield Trial(f"camera that blurs by {blur} px", scene, blurred.astype("f4"), unit=20.0)
 
 
 def fields_that_turn() -> Iterator[Trial]:
@@ -261,7 +262,7 @@ def run(trial: Trial) -> str:
     """Track a movie, and return its line."""
     with work_folder() as folder:
         tracks, _ = track(trial.counts, folder, trial.fit, trial.columns)
-        found = score(tracks, trial.scene, border=trial.border, tolerance=trial.tolerance)
+        found = score(tracks, trial.scene, border=trial.border, tolerance=trial.tolerance, unit=trial.unit)
         jumps = change_points(tracks, 0.99)
     background = float(np.mean(trial.scene.background))
     least = bound(float(np.median(trial.scene.amplitudes.max(axis=0))), trial.scene.sigma, background, WINDOW)[0]

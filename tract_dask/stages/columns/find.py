@@ -21,6 +21,7 @@ from .relief import Places
 from .scene import Scene, scene_of
 from .singles import Fits, Seeds, fitted_alone
 from .sites import lattice_sites
+from .slopes import drawn_by_slopes
 from .twins import twins_of
 from .window_size import neighbour_distance, usual_sigma
 
@@ -102,6 +103,8 @@ def find_columns(
     if seeds is not None and "share" in seeds:
         fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
     fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
+    alone = (fits.status == 0) & (best.groups == 0)
+    fit[:, [X, Y]] -= drawn_by_slopes(np.where(alone[:, None], fit, np.nan), fits.window_px)
     places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], fits.places)
     twins = twins_of(places, same_column_px(places, best.groups, _SAME * best.spacing))
     kept = np.setdiff1d(np.arange(len(places)), list(twins))

@@ -27,6 +27,7 @@ from ...store.journal import left_over
 from ...store.movie import Movie
 from ...store.provenance import provenance
 from ...store.strangers import MOVIE_KEY
+from ..columns.slopes import drawn_by_slopes
 from ..columns.window_size import neighbour_distance, resolve_blur, resolve_window
 from ..pixel_range import check_pixels
 from .goodness import Freedom
@@ -165,6 +166,12 @@ class Job:
         reference[:, BACKGROUND] += self.dark_variance
         reference[:, [AMPLITUDE, BACKGROUND]] /= self.unit
         return reference
+
+    @cached_property
+    def drawn(self) -> Floats:
+        """(columns, 2) by how much sloping backgrounds draw fits along x and y, px; 0 for groups."""
+        alone = self.known & (self.columns["status_ref"].to_numpy() == 0) & (self.group_numbers == 0)
+        return drawn_by_slopes(np.where(alone[:, None], self.reference, np.nan), self.window_px)
 
     @cached_property
     def centre(self) -> Floats:

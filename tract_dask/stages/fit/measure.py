@@ -237,6 +237,7 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
             limits,
             job,
         )
+        fits.estimates[:, [X, Y]] -= np.tile(job.drawn, (len(y), 1))
         parts.append(fits)
     return FrameFits.joined(parts, places.outside.shape)
 

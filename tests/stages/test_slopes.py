@@ -1,0 +1,67 @@
+"""Places of columns on a background that rises."""
+
+import numpy as np
+import pytest
+
+from tract_dask.kernels.gaussian.fit import fit_gaussians
+from tract_dask.kernels.gaussian.model import evaluate
+from tract_dask.stages.columns.slopes import background_slopes, drawn_by_slopes
+
+WINDOW, SIGMA, HEIGHT = 21, 5.0, 2.0
+
+
+def _lattice(n=6, spacing=40.0):
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    return spacing * np.stack([i.ravel() + j.ravel() / 2, j.ravel() * np.sqrt(0.75)], axis=1) + 40
+
+
+def _fits(places, level, height=HEIGHT, wide=(SIGMA, SIGMA, 0.0)):
+    """Fits of Equation 1, with the widths known, to columns on the background ``level`` (x, y), without noise."""
+    half = WINDOW // 2
+    corner = np.rint(places).astype(int) - half
+    truth = np.column_stack([np.full(len(places), height), places, np.tile([*wide, 0.0], (len(places), 1))])
+    y, x = np.mgrid[:WINDOW, :WINDOW]
+    windows = np.stack(
+        [
+            evaluate(own, x + left, y + top) + level(x + left, y + top)
+            for own, (left, top) in zip(truth, corner, strict=True)
+        ]
+    ).astype(np.float32)
+    start = truth.copy()
+    start[:, 1:3] -= corner
+    start[:, 6] = windows.mean(axis=(1, 2))
+    reach = np.array([5.0, 5, 5, 5, 5, 1, 50])
+    found = fit_gaussians(windows, start, start - reach, start + reach, fixed_shape=True, radius_px=WINDOW / 2)
+    fit = found.estimates.copy()
+    fit[:, 1:3] += corner
+    return fit
+
+
+@pytest.mark.parametrize("height", [HEIGHT, -HEIGHT])
+def test_columns_are_put_back_down_a_slope(height):
+    """Columns are drawn by 0.7 px up the slope, or down it where they are dark; what is left is below 0.03 px."""
+    places = _lattice()
+    fit = _fits(places, lambda x, y: 8 + 0.02 * x - 0.01 * y, height)
+    off = fit[:, 1:3] - places
+    assert abs(off[:, 0]).min() > 0.6
+    np.testing.assert_allclose(drawn_by_slopes(fit, WINDOW), off, atol=0.03)
+
+
+def test_no_slope_is_seen_in_an_even_background_nor_in_one_that_differs_from_column_to_column():
+    places = _lattice()
+    assert not background_slopes(places, np.full(len(places), 8.0)).any()
+    kinds = np.where(np.arange(len(places)) % 2, 8.0, 9.0)
+    assert not background_slopes(places, kinds + np.random.default_rng(1).normal(0, 0.05, len(places))).any()
+
+
+def test_slopes_need_columns_around():
+    places = _lattice()
+    level = 8 + 0.02 * places[:, 0]
+    np.testing.assert_allclose(background_slopes(places, level), np.tile([0.02, 0], (len(places), 1)), atol=1e-9)
+    assert not background_slopes(places[:8], level[:8]).any()
+    level[9:] = np.nan
+    found = background_slopes(places, level)
+    np.testing.assert_allclose(found[:9, 0], 0.02, atol=1e-9)
+    assert not found[9:].any()
+    in_a_row = np.column_stack([40.0 * np.arange(12), np.full(12, 7.0)])
+    np.testing.assert_allclose(background_slopes(in_a_row, 0.02 * in_a_row[:, 0])[:, 0], 0.02, atol=1e-9)
