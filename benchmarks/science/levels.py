@@ -55,7 +55,7 @@ def _of(made: Made, work: Path) -> dict[str, str]:
     held = (rates["low"] <= HOP_CHANCE) & (rates["high"] >= HOP_CHANCE)
     found["95 % intervals that hold the rate of hops"] = share(held.to_numpy()[~rates["counted"].to_numpy()])
     never = kinds == 2
-    passes = (tracks["status"].to_numpy() & np.uint8(REJECTED)) == 0
+    passes = (tracks["status"].to_numpy() & np.uint16(REJECTED)) == 0
     found["accepted fits where there is no column, 5 % stated"] = share(passes[:, never])
     for rate in (0.05, 0.01):
         seen = present(tracks, rate).to_numpy()

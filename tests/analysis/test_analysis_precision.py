@@ -111,7 +111,7 @@ def draw_tracks(
             "intensity": (both, np.ones((n_frames, n))),
             "intensity_error": (both, np.ones((n_frames, n))),
             "intensity_stderr": (both, np.ones((n_frames, n))),
-            "status": (both, np.zeros((n_frames, n), np.uint8)),
+            "status": (both, np.zeros((n_frames, n), np.uint16)),
             "noise": ("frame", np.ones(n_frames)),
             "x_ref": ("column_id", places[:, 0]),
             "y_ref": ("column_id", places[:, 1]),

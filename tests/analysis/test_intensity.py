@@ -53,7 +53,7 @@ def draw_tracks(n_frames: int = 300, n_columns: int = 6, spread: float = 50.0) -
             "intensity": (both, intensity, {"units": "counts"}),
             "intensity_error": (both, intensities(fit)[1]),
             "intensity_stderr": (both, np.full((n_frames, n_columns), spread)),
-            "status": (both, np.zeros((n_frames, n_columns), np.uint8)),
+            "status": (both, np.zeros((n_frames, n_columns), np.uint16)),
         },
         coords={"column_id": np.arange(1, n_columns + 1), **schema.coordinates(n_frames)},
         attrs={"pixel_size_pm": PIXEL_PM, "dose": 125.0, "intensity_scale": "paper"},

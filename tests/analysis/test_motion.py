@@ -55,7 +55,7 @@ def tracks_of(places_pm, stderr_pm=2.0, kind="Ce", **attributes) -> xr.Dataset:
                 for name in ("intensity", "intensity_error", "intensity_stderr")
             },
             "centroid": (("frame", "column_id", "axis"), places_pm / PIXEL_PM),
-            "status": (("frame", "column_id"), np.where(lost, np.uint8(1), np.uint8(0))),
+            "status": (("frame", "column_id"), np.where(lost, np.uint16(1), np.uint16(0))),
             "y_ref": ("column_id", mean[:, 0]),
             "x_ref": ("column_id", mean[:, 1]),
             "kind": ("column_id", schema.texts(np.broadcast_to(kind, n_columns))),

@@ -76,7 +76,7 @@ def given_tracks(numbers, relative_error, n_frames=400, seed=0, vacuum=5.0, thre
             "intensity": (each, drawn),
             "intensity_error": (each, np.broadcast_to(sigma, drawn.shape).copy()),
             "intensity_stderr": (each, np.broadcast_to(sigma, drawn.shape).copy()),
-            "status": (each, weak.astype(np.uint8)),
+            "status": (each, weak.astype(np.uint16)),
             "noise": ("frame", noise),
             "fit_ref": (("column_id", "parameter"), reference),
         },

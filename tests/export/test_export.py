@@ -54,7 +54,7 @@ def store(scene, tmp_path):
         if name not in ("time", "drift_measured")
     }
     values["fit"][..., parameters.THETA] = rng.uniform(-1.5, 1.5, (N_FRAMES, N_COLUMNS))
-    values["status"] = np.zeros((N_FRAMES, N_COLUMNS), np.uint8)
+    values["status"] = np.zeros((N_FRAMES, N_COLUMNS), np.uint16)
     values["status"][3, 1], values["status"][9, 2] = 1, 2
     store_fits(path, values, 4)
     return path

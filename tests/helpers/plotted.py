@@ -33,7 +33,7 @@ def make_tracks(n_frames: int = N_FRAMES) -> xr.Dataset:
     fit[JUMP_FRAME:, 1, 1:3] += JUMP_PX
     stderr = np.broadcast_to(0.1 * np.arange(1.0, n + 1)[:, None], (n_frames, n, 7)).copy()
     intensity = 1000 + rng.normal(size=(n_frames, n)) * 10 * np.arange(1, n + 1)
-    status = np.zeros((n_frames, n), np.uint8)
+    status = np.zeros((n_frames, n), np.uint16)
     status[4, 0] = schema.Status.BELOW_NOISE
     columns = column_dataset(PLACES, "Ce", fit=parameters())
     values = {

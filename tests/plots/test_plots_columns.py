@@ -29,7 +29,7 @@ def scene(ny: int = 80, nx: int = 100, pixel_size_pm: float | None = 8.0) -> xr.
 
 def some_columns(count: int = 6) -> xr.Dataset:
     places = np.stack([np.linspace(5, 99, count), np.linspace(3, 75, count)], axis=1)
-    status = np.zeros(count, np.uint8)
+    status = np.zeros(count, np.uint16)
     status[0], status[1] = Status.OUTSIDE_FRAME, Status.AT_BOUND | Status.BELOW_NOISE
     columns = column_dataset(places, ["Ce" if n % 2 else "O" for n in range(count)], status=status)
     return columns.assign_attrs(spacing_px=20.0)

@@ -36,7 +36,7 @@ def results_from(truth: xr.Dataset, error_px: np.ndarray, offset_px: float) -> x
             "fit": (RESULTS["fit"].dims, fit),
             "stderr": (RESULTS["stderr"].dims, np.ones_like(fit)),
             "drift": (("frame", "axis"), drift),
-            "status": (RESULTS["status"].dims, np.where(gone, int(Status.BELOW_NOISE), 0).astype(np.uint8)),
+            "status": (RESULTS["status"].dims, np.where(gone, int(Status.BELOW_NOISE), 0).astype(np.uint16)),
             "x_ref": ("column_id", cerium["x"].to_numpy()[0] + offset_px),
             "y_ref": ("column_id", cerium["y"].to_numpy()[0] + offset_px),
         },

@@ -48,11 +48,11 @@ class Fits:
             if name != "status"
         }
         self.known["stderr"] = rng.uniform(0.1, 0.4, (N_FRAMES, N_COLUMNS, 7))
-        status = np.zeros((N_FRAMES, N_COLUMNS), np.uint8)
+        status = np.zeros((N_FRAMES, N_COLUMNS), np.uint16)
         status[rng.random(status.shape) < 0.2] = Status.BELOW_NOISE
         status[:, 2] = Status.OUTSIDE_FRAME  # never fitted
         status[5] = Status.BAD_FRAME
-        status[rng.random(status.shape) < 0.1] |= np.uint8(Status.SHAPE_AT_BOUND)  # accepted nevertheless
+        status[rng.random(status.shape) < 0.1] |= np.uint16(Status.SHAPE_AT_BOUND)  # accepted nevertheless
         self.known["status"] = status
 
     def create(self) -> None:

@@ -119,7 +119,7 @@ class Fits:
         motion = linear_motion.estimate(away, job.from_centre, weight)
         self.values = {
             "fit": np.repeat(places[..., :1], 7, axis=-1),
-            "status": np.where(np.isnan(away[..., 0]), Status.NOT_CONVERGED, 0).astype(np.uint8),
+            "status": np.where(np.isnan(away[..., 0]), Status.NOT_CONVERGED, 0).astype(np.uint16),
             "motion_measured": motion[0],
             "motion_stderr": motion[1],
         }
@@ -187,7 +187,7 @@ def test_one_column_that_is_named_stands_still_with_and_without_a_measured_drift
 def test_a_frame_without_the_columns_that_stand_still_is_lost():
     job = still(100)
     values = {"fit": np.tile(job.reference, (2, 1, 1)), "centroid": np.zeros((2, 100, 2)), "drift": np.zeros((2, 2))}
-    values["status"] = np.zeros((2, 100), np.uint8)
+    values["status"] = np.zeros((2, 100), np.uint16)
     values["status"][1, :98] = Status.NOT_CONVERGED
     turning = PutRight((0,), np.ones(100, bool), np.zeros(2), job.reference[:, [X, Y]], np.ones(100))
     lost = turning.put_right(values)["status"] & Status.LOST_FRAME

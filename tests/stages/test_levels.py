@@ -36,7 +36,7 @@ def test_empty_places_pass_at_the_stated_rates(made, settings, tmp_path):
     def within(share, level):
         return abs(share - level) <= 0.02 + 2 * np.sqrt(level * (1 - level) / empty.sum())
 
-    good = (tracks["status"].to_numpy() & np.uint8(REJECTED)) == 0
+    good = (tracks["status"].to_numpy() & np.uint16(REJECTED)) == 0
     assert within(good[empty].mean(), 0.05)
     for rate in (0.1, 0.01):
         assert within(present(tracks, rate).to_numpy()[empty].mean(), rate)
@@ -55,7 +55,7 @@ def test_what_a_camera_spreads_passes_at_the_stated_rate(tmp_path):
     camera = Camera(correlation=tuple(map(tuple, shared.tolist())))
     still = np.zeros((20, made.n_columns, 2))
     tracks = made.tracks(tmp_path, still, np.zeros(still.shape[:2], bool), camera=camera)
-    good = (tracks["status"].to_numpy() & np.uint8(REJECTED)) == 0
+    good = (tracks["status"].to_numpy() & np.uint16(REJECTED)) == 0
     assert good.mean() == pytest.approx(0.05, abs=0.02)
 
 

@@ -26,7 +26,7 @@ from ..stages.columns.find import find_columns
 from ..stages.columns.window_size import neighbour_distance, resolve_blur, resolve_window
 from ..store.columns import column_dataset, positions
 from ..store.files import read_small, write_aside
-from ..store.schema import REJECTED
+from ..store.schema import REJECTED, is_accepted
 from ..store.tables import decoded, parse_number, parse_table
 from .intensity import UNIT
 
@@ -250,11 +250,11 @@ def _measured(image: Floats, columns: xr.Dataset, window_px: int, settings: FitS
     """Return the fits of the columns of an image, (columns, 7); NaN where a fit is not accepted or left its column."""
     reach = max(1.0, _REACH * window_px)
     found = _found(image, columns, window_px, settings, contrast)[["fit_ref", "status_ref"]].reindex(
-        column_id=columns["column_id"], fill_value={"status_ref": REJECTED}
+        column_id=columns["column_id"], fill_value={"status_ref": np.uint16(REJECTED)}
     )
     fit = found["fit_ref"].to_numpy().copy()
     away = np.hypot(*(fit[:, [X, Y]] - positions(columns)).T)
-    kept = ((found["status_ref"].to_numpy() & REJECTED) == 0) & (away < reach)
+    kept = is_accepted(found["status_ref"].to_numpy()) & (away < reach)
     fit[~kept] = np.nan
     if settings.estimator == "poisson":
         fit[kept] = _likeliest(image, fit[kept], window_px, settings)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.gaussian.parameters import AMPLITUDE, X, Y
-from ..store.schema import NOT_SEEN, REJECTED, Status
+from ..store.schema import NOT_SEEN, Status, is_accepted
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -141,7 +141,7 @@ class Part:
     def __init__(self, opened: Callable[[str], Any], start: int, stop: int) -> None:
         found = {name: np.asarray(opened(name)[start:stop]) for name in _READ}
         fit, stderr, self._status = found["fit"], found["stderr"], found["status"]
-        self._fitted, self._accepted = ((self._status & int(flags)) == 0 for flags in (NOT_SEEN, REJECTED))
+        self._fitted, self._accepted = (self._status & np.uint16(NOT_SEEN)) == 0, is_accepted(self._status)
         self._r_squared, self._amplitude, self._drift = found["r_squared"], fit[..., AMPLITUDE], found["drift"]
         self._unlike = self._accepted & (found["p_value"] < UNLIKELY)
         own, errors = (fit, "intensity"), (stderr, "intensity_stderr")

@@ -24,7 +24,7 @@ from ..kernels.gaussian import parameters
 from ..kernels.gaussian.intensity import Floats
 from ..store import disk, files, metadata, results, schema
 from ..store.run_folder import RunFolder
-from ..store.schema import REJECTED
+from ..store.schema import is_accepted
 from ..store.source_pixels import in_source_pixels
 
 ROWS = 1 << 17
@@ -125,7 +125,7 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
     for name in [*said, *map(str, tracks.data_vars)]:
         if name not in columns and name not in _LEFT_OUT and "frame" in tracks[name].dims:
             columns |= _flat(name, tracks[name], n_columns)
-    columns["accepted"] = ((tracks["status"] & np.uint8(REJECTED)) == 0).to_numpy().ravel()
+    columns["accepted"] = is_accepted(tracks["status"]).to_numpy().ravel()
     return pd.DataFrame(columns)
 
 

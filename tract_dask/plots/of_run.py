@@ -28,6 +28,7 @@ from ..store import datasets, metadata
 from ..store.movie import Movie, open_movie
 from ..store.results import open_results
 from ..store.run_folder import RunFolder
+from ..store.schema import is_accepted
 
 _GROUPS = (1, 2, 4)
 """Frames in a sum, for figures against dose."""
@@ -130,7 +131,7 @@ class Run:
     def neighbours(self) -> list[int]:
         """IDs of the column that spreads most among those seen in most frames, and of those nearest to it."""
         fits = self.tracks["fit"].sel(parameter=["x", "y"])
-        good = self.tracks["status"] == 0
+        good = is_accepted(self.tracks["status"])
         spread = fits.where(good).std("frame").max("parameter").where(good.mean("frame") > 0.5).to_numpy()
         places = np.stack([self.tracks["x_ref"], self.tracks["y_ref"]], axis=1)
         centre = places[int(np.nanargmax(spread))] if np.isfinite(spread).any() else places.mean(axis=0)
@@ -141,7 +142,7 @@ class Run:
     def frames(self) -> tuple[int, int]:
         """The two neighbouring frames between which those columns move most."""
         some = self.tracks.sel(column_id=self.neighbours)
-        place = some["fit"].sel(parameter=["x", "y"]).where(some["status"] == 0).to_numpy()
+        place = some["fit"].sel(parameter=["x", "y"]).where(is_accepted(some["status"])).to_numpy()
         moved = np.hypot(*np.moveaxis(np.diff(place, axis=0), -1, 0))
         seen = np.isfinite(moved).sum(axis=1, keepdims=True)
         ranked = np.where(seen == seen.max(initial=0), np.nan_to_num(moved, nan=-1), -1)

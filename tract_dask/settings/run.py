@@ -233,6 +233,12 @@ class FitSettings(Settings):
         unit="px",
         low=0.1,
     )
+    search_px: float | None = setting(
+        None,
+        "How far from its place a column that has left it is searched for; unset: 1.15 windows; 0: it is not",
+        unit="px",
+        low=0,
+    )
     sigma_factor: float = setting(
         1.3, "Free sigmas stay within this factor of those in the summed image", low=1.01, high=100
     )

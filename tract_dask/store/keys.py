@@ -101,6 +101,7 @@ KEYED: dict[str, tuple[Keyed, ...]] = {
         Keyed("fit.tolerance_px", 1e-4),
         Keyed("fit.max_iterations", 50),
         Keyed("fit.drift_columns", None),
+        Keyed("fit.search_px", None),
     ),
 }
 """The settings of each stage's key. The other settings count by what comes of them: :data:`OTHERWISE`."""

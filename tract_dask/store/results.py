@@ -22,7 +22,7 @@ from ..settings.toml import from_toml
 from . import datasets, disk, files, metadata, schema
 from .journal import Journal, journal_beside
 from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
-from .schema import REJECTED, Status
+from .schema import Status, is_accepted
 from .shard_files import CHUNK_KEYS, MARKED, chunk_path, codecs
 from .source_pixels import with_source_coordinates
 
@@ -368,8 +368,8 @@ def accepted(dataset: xr.Dataset, threshold: float | None = None) -> xr.Dataset:
     status = dataset["status"]
     if threshold is not None:
         weak = ~(abs(dataset["fit"].sel(parameter="amplitude", drop=True)) > weakest(dataset, threshold))
-        status = (status & ~np.uint8(Status.BELOW_NOISE)) | (weak * np.uint8(Status.BELOW_NOISE))
-    good = (status & np.uint8(REJECTED)) == 0
+        status = (status & ~np.uint16(Status.BELOW_NOISE)) | (weak * np.uint16(Status.BELOW_NOISE))
+    good = is_accepted(status)
     return dataset.assign({name: dataset[name].where(good) for name in FITTED} | {"status": status})
 
 

@@ -38,6 +38,9 @@ class Status(enum.IntFlag):
     is then the best one for a column of that shape, and is accepted. ``INCOMPLETE`` is a window in which pixels are
     missing: the fit is to those that are there, its errors say what is lost, and it is accepted. ``LOST_FRAME`` is one
     that does not resemble the others, for the crystal is away or out of focus: its drift is interpolated.
+    ``HOPPED`` is a column that was found away from its place, beyond the bounds of the usual fit: it is accepted.
+    ``SAME_ATOM`` is a fit that lies on the atom of another column, which is nearer to its own place: this column is not
+    there.
     """
 
     OK = 0
@@ -49,13 +52,27 @@ class Status(enum.IntFlag):
     SHAPE_AT_BOUND = 32
     INCOMPLETE = 64
     LOST_FRAME = 128
+    HOPPED = 256
+    SAME_ATOM = 512
 
 
 NOT_SEEN = Status.OUTSIDE_FRAME | Status.BAD_FRAME | Status.LOST_FRAME
 """With any of these flags the frame does not show the column's place: whether it is there is not known."""
 
-REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | NOT_SEEN
+REJECTED = Status.BELOW_NOISE | Status.NOT_CONVERGED | Status.AT_BOUND | Status.SAME_ATOM | NOT_SEEN
 """A fit with any of these flags is not accepted."""
+
+
+def is_accepted(status: Any) -> Any:
+    """Tell which fits are accepted, from their flags, as an array or a DataArray of them.
+
+    Examples
+    --------
+    >>> is_accepted(np.array([Status.OK, Status.INCOMPLETE, Status.HOPPED, Status.AT_BOUND])).tolist()
+    [True, True, True, False]
+    """
+    return (status & np.uint16(REJECTED)) == 0
+
 
 STATUS_ATTRIBUTES = {
     "flag_masks": [int(flag) for flag in Status if flag],
@@ -116,7 +133,7 @@ RESULTS = _declare(
     Variable("intensity", _COLUMN, "float64", "counts", "Column intensity, Equation 3", _NAN),
     Variable("intensity_error", _COLUMN, "float64", "counts", "Error of the intensity, Equation 5", _NAN),
     Variable("intensity_stderr", _COLUMN, "float64", "counts", "Standard error of the intensity, from the fit", _NAN),
-    Variable("status", _COLUMN, "uint8", "1", "Flags that speak against a fit", int(Status.NOT_CONVERGED)),
+    Variable("status", _COLUMN, "uint16", "1", "Flags that speak against a fit", int(Status.NOT_CONVERGED)),
     Variable(
         "presence",
         _COLUMN,

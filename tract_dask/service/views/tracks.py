@@ -206,7 +206,7 @@ def _around(path: Path, frames: tuple[int, ...], reach: int) -> xr.Dataset:
         values = np.concatenate([np.asarray(array[run[0] : run[-1] + 1]) for run in runs])
         tracks[name] = (schema.RESULTS[name].dims, values)
     done = xr.DataArray(finished[wanted // step], dims="frame")
-    return tracks.assign(status=tracks["status"].where(done, np.uint8(schema.Status.NOT_CONVERGED)))
+    return tracks.assign(status=tracks["status"].where(done, np.uint16(schema.Status.NOT_CONVERGED)))
 
 
 def open_finished(path: Path) -> xr.Dataset:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...kernels import linear_motion
 from ...kernels.gaussian.intensity import Floats
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
-from ...store.schema import REJECTED
+from ...store.schema import Status, is_accepted
 from .job import Job
 
 CERTAIN = 13.8
@@ -38,7 +38,7 @@ class CommonMotion(NamedTuple):
     stderr: Floats
 
 
-def common_motion(estimates: Floats, status: NDArray[np.uint8], drift: Floats, job: Job) -> CommonMotion:
+def common_motion(estimates: Floats, status: NDArray[np.uint16], drift: Floats, job: Job) -> CommonMotion:
     """Return what the accepted columns of each frame do together."""
     motion = np.zeros_like(drift)
     found = CommonMotion(motion, np.full((len(drift), 4), np.nan), np.full((len(drift), 4), np.nan))
@@ -46,7 +46,7 @@ def common_motion(estimates: Floats, status: NDArray[np.uint8], drift: Floats, j
         return found
     away = estimates[..., [Y, X]] - drift[:, None] - job.reference[:, [Y, X]]
     expected = errors_of(job.reference)
-    good = (status & REJECTED) == 0
+    good = still(status)
     enough = good.sum(axis=1) >= job.refined_by
     if enough.any():
         common, error, weight = _biweight(away[enough], expected, good[enough])
@@ -56,6 +56,11 @@ def common_motion(estimates: Floats, status: NDArray[np.uint8], drift: Floats, j
             away[enough][..., ::-1], job.from_centre, weight.min(axis=1)
         )
     return found
+
+
+def still(status: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Tell which fits are of columns that are where they belong: one that hopped tells nothing of the crystal."""
+    return np.asarray(is_accepted(status) & ((status & np.uint16(Status.HOPPED)) == 0))
 
 
 def errors_of(columns: Floats) -> Floats:

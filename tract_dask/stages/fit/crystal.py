@@ -22,7 +22,7 @@ from ...kernels.gaussian.parameters import THETA, X, Y
 from ...store import schema
 from ...store.journal import Journal
 from ...store.parts import AGAIN, DamagedPartError, Parts, layout
-from .common_motion import errors_of
+from .common_motion import errors_of, still
 from .job import Job
 
 Floats = NDArray[np.float64]
@@ -108,7 +108,7 @@ class Crystal:
         return {name: np.concatenate([part[name] for part in parts]) for name in CHANGED}
 
     def _put_right(self, values: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        good = ((values["status"] & schema.REJECTED) == 0) & self.reference
+        good = still(values["status"]) & self.reference
         fit, centroid, drift = values["fit"].copy(), values["centroid"].copy(), values["drift"].copy()
         seen = fit[..., [X, Y]] - self.centre
         shift, motion = linear_motion.fit(seen, self.places, self.expected, good, self.motions)
@@ -118,7 +118,7 @@ class Crystal:
         fit[..., THETA] += motion[:, :1]
         bad = (values["status"] & schema.Status.BAD_FRAME).any(axis=1)
         few = (good.sum(axis=1) < linear_motion.fewest(self.motions)) & ~bad
-        status = values["status"] | np.where(few, schema.Status.LOST_FRAME, 0).astype(np.uint8)[:, None]
+        status = values["status"] | np.where(few, schema.Status.LOST_FRAME, 0).astype(np.uint16)[:, None]
         return {"fit": fit, "centroid": centroid, "drift": drift + shift[:, ::-1], "motion": motion, "status": status}
 
 
@@ -195,13 +195,13 @@ class _Seen:
         most = int(np.clip(_MOST_FITS // (step * len(job.reference)), _FEWEST_SHARDS, _MOST_SHARDS))
         shards = shards[np.unique(np.linspace(0, len(shards) - 1, most).round().astype(int))]
         fit = np.empty((step, len(job.reference), schema.SIZES["parameter"]))
-        status = np.empty(fit.shape[:2], np.uint8)
+        status = np.empty(fit.shape[:2], np.uint16)
         places, numbers = [], []
         for shard in shards.tolist():
             here = min(step, frames - shard * step)
             parts.read(shard, "fit", fit)
             parts.read(shard, "status", status)
-            good = (status[:here] & schema.REJECTED) == 0
+            good = still(status[:here])
             places.append(np.where(good[..., None], fit[:here, :, [X, Y]], np.nan))
             numbers.append(shard * step + np.arange(here))
         away = np.concatenate(places) - job.reference[:, [X, Y]]

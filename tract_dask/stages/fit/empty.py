@@ -13,7 +13,7 @@ from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.windows import Tiles, gaussian_kernel
 from ...settings.run import FitSettings
 from ...store.columns import column_dataset
-from ...store.schema import REJECTED
+from ...store.schema import is_accepted
 from .job import Job
 from .measure import damping, fit_places, noise_left, status_of
 from .places import Places
@@ -42,7 +42,7 @@ def calibrated(job: Job) -> Job:
     sample, frame, noise = _noise_alone(job.in_units)
     places = Places.of(frame.shape, 0, 1, sample)
     fits = fit_places(places, Tiles(frame[None, None], np.zeros((1, 1), np.int64), frame.shape), 1.0, sample)
-    passes = (status_of(fits, places, np.zeros((1, 1))) & np.uint8(REJECTED)) == 0
+    passes = is_accepted(status_of(fits, places, np.zeros((1, 1))))
     amplitude = np.where(passes, np.abs(fits.estimates[..., AMPLITUDE]), 0.0)
     noise *= noise_left(job.settings.noise_blur_px, job.correlation)
     limit = float(np.quantile(amplitude, 1 - EMPTY_PASS)) / noise

@@ -30,9 +30,11 @@ from ...store.strangers import MOVIE_KEY
 from ..columns.slopes import drawn_by_slopes
 from ..columns.window_size import neighbour_distance, resolve_blur, resolve_window
 from ..pixel_range import check_pixels
+from .cells import Cells
 from .goodness import Freedom
 from .groups import Groups, plan_groups
 from .noise_size import WindowNoise, window_noise
+from .same_atom import Pairs
 from .vacuum import check_box, find_vacuum, why_unusable
 
 
@@ -203,6 +205,16 @@ class Job:
     def filters(self) -> Filters:
         """The matched filter of each column, by which it is told whether it is there."""
         return matched_filters(self.reference, self.window_px, self.settings.window_blur_px)
+
+    @cached_property
+    def cells(self) -> Cells:
+        """Where columns may be that have left their places."""
+        return Cells(self.reference, self.filters, self.settings.search_px)
+
+    @cached_property
+    def near(self) -> Pairs:
+        """Pairs of columns whose fits may end on one atom."""
+        return Pairs.of(self.reference, min(self.settings.max_shift_px or self.window_px / 4, self.window_px / 2))
 
     @cached_property
     def window_noise(self) -> WindowNoise:

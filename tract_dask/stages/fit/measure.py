@@ -11,16 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels import linear_motion
-from ...kernels.centroids import BEST_RADIUS, SMALLEST_RADIUS_PX, window_centroids
 from ...kernels.filling import fill_near
-from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.intensity import INTENSITY_SCALE, Floats, intensities
-from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
+from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.presence import strengths
 from ...kernels.windows import Tiles, cut_windows, gaussian_kernel
 from ...settings.run import FitSettings
 from ...store.movie import Movie
-from ...store.schema import SIZES, Status
+from ...store.schema import SIZES, Status, is_accepted
 from ...store.shards import Shard
 from .common_motion import CommonMotion, common_motion, masked_median
 from .filters import above_offset, filter_frame
@@ -32,6 +30,9 @@ from .joint_fits import Frames, fit_groups
 from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 from .noise_size import frame_noise
 from .places import Places
+from .same_atom import on_one_atom
+from .search import search
+from .window_fits import bounds_of, fit_windows, reach_of
 
 Values = dict[str, np.ndarray[Any, Any]]
 
@@ -45,9 +46,6 @@ _ROUNDS = 4
 
 _CERTAIN = 33.4
 """Chi-squared of the four numbers of a linear motion at 0.999999."""
-
-_AT_BOUND = 1e-9
-"""Share of the interval between its bounds within which a parameter is at its bound."""
 
 
 def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Values:
@@ -64,9 +62,10 @@ def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Val
 
 
 class _Pixels(NamedTuple):
-    """The tiles of some frames in which windows at given places lie."""
+    """The tiles of some frames that hold given boxes."""
 
-    tiles: Callable[[Places], Tiles]
+    tiles: Callable[[NDArray[np.int64]], Tiles]
+    """Of boxes, as :meth:`.movie.Movie.read_tiles` takes them."""
     stop: int
     """The frame after the last one."""
     gain: float
@@ -79,7 +78,7 @@ def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[P
     for start in range(shard.start, shard.stop, movie.layer_frames):
         stop = min(start + movie.layer_frames, shard.stop)
         if not whole:
-            read = partial(_read_tiles, movie, start, stop, job)
+            read = partial(movie.read_tiles, start, stop)
             yield Places.of(frame_shape, start, stop, job), _Pixels(read, stop, gain)
             continue
         for number, pixels in enumerate(movie.read(start, stop), start):
@@ -90,11 +89,7 @@ def _read(movie: Movie, shard: Shard, job: Job, whole: bool) -> Iterator[tuple[P
             yield Places.of(frame_shape, number, number + 1, job), _Pixels(partial(_same, tiles), number + 1, lacking)
 
 
-def _read_tiles(movie: Movie, start: int, stop: int, job: Job, places: Places) -> Tiles:
-    return movie.read_tiles(start, stop, places.boxes(job, movie.shape[1:]))
-
-
-def _same(tiles: Tiles, _: Places) -> Tiles:
+def _same(tiles: Tiles, _: NDArray[np.int64]) -> Tiles:
     return tiles
 
 
@@ -111,18 +106,24 @@ def _measure_frames(places: Places, pixels: _Pixels, job: Job, rounds: int = _RO
     Where the crystal has turned or grown so far that windows no longer hold their columns in the middle, they are cut
     again where it has carried them.
     """
-    tiles, gain = pixels.tiles(places), pixels.gain
+    tiles, gain = pixels.tiles(places.boxes(job)), pixels.gain
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
     good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None]) & job.counted
     window = job.window_noise
     size, number = frame_noise(in_frame.ratio, good, window.left, window.free)
-    in_frame, unknown = in_frame.with_noise(size), in_frame.incomplete | job.settings.filters_frames
+    in_frame = in_frame.with_noise(size)
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
-    status = status_of(in_frame, places, job.settings.threshold * job.scale * noise)
+    weakest = job.settings.threshold * job.scale * noise
+    status = status_of(in_frame, places, weakest)
     common = common_motion(in_frame.estimates, status, places.drift, job)
     if rounds and (displaced := _carried(common, places, job)) is not None:
         again = Places.of(tiles.shape, places.start, pixels.stop, job, displaced)
         return _measure_frames(again, pixels, job, rounds - 1)
+    hopped = search(in_frame, status, places, pixels.tiles, gain, (precision, size), common.shift, job)
+    status = status_of(in_frame, places, weakest) | np.where(hopped, Status.HOPPED, 0).astype(np.uint16)
+    home = job.reference[:, [Y, X]] + (places.drift + common.shift)[:, None] + places.displaced
+    taken = on_one_atom(in_frame.estimates, home, is_accepted(status), job.near)
+    status |= np.where(taken, Status.SAME_ATOM | Status.BELOW_NOISE, 0).astype(np.uint16)
     drift: Floats = places.drift + common.shift
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     fits.estimates[..., BACKGROUND] -= job.dark_variance
@@ -139,7 +140,7 @@ def _measure_frames(places: Places, pixels: _Pixels, job: Job, rounds: int = _RO
         "presence": np.where(places.lost[:, None], np.nan, fits.strength * precision),
         "presence_vacuum": empty,
         "r_squared": fits.r_squared,
-        "p_value": np.where(unknown, np.nan, chance).astype(np.float32),
+        "p_value": np.where(in_frame.incomplete | job.settings.filters_frames, np.nan, chance).astype(np.float32),
         "n_iterations": fits.n_iterations,
         "drift": drift,
         "motion": np.zeros((len(drift), SIZES["motion_kind"])),
@@ -159,7 +160,7 @@ def _carried(common: CommonMotion, places: Places, job: Job) -> Floats | None:
     motion = np.where(certain[:, None], common.linear, 0)
     displaced = (linear_motion.moved(job.from_centre, motion) - job.from_centre)[..., ::-1]
     more = np.hypot(*np.moveaxis(displaced - places.displaced, -1, 0)).max(axis=1, initial=0)
-    return displaced if (more > _reach(job) / 4).any() else None
+    return displaced if (more > reach_of(job) / 4).any() else None
 
 
 def _noise(
@@ -192,7 +193,7 @@ def _noise(
         return noise, np.where(known > 0, white / known, np.nan), empty.astype(np.float32)
 
 
-def status_of(fits: FrameFits, places: Places, weakest: Floats) -> NDArray[np.uint8]:
+def status_of(fits: FrameFits, places: Places, weakest: Floats) -> NDArray[np.uint16]:
     """Return what speaks against each fit, (frames, columns); ``weakest``, alike, is the smallest good amplitude."""
     inside, amplitude = ~places.outside, np.abs(fits.estimates[..., AMPLITUDE])
     flags = {
@@ -205,9 +206,9 @@ def status_of(fits: FrameFits, places: Places, weakest: Floats) -> NDArray[np.ui
         Status.BAD_FRAME: places.bad[:, None],
         Status.LOST_FRAME: places.lost[:, None],
     }
-    status = np.zeros(inside.shape, np.uint8)
+    status = np.zeros(inside.shape, np.uint16)
     for flag, found in flags.items():
-        status |= np.uint8(flag) * found
+        status |= np.uint16(flag) * found
     return status
 
 
@@ -218,7 +219,8 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
     """
     n_frames, n_columns = places.outside.shape
     batch = max(1, _BATCH_BYTES // (4 * job.window_px**2 * n_columns))
-    bounds, parts = _bounds(places, job), []
+    offset = places.drift[:, None] + places.displaced - places.corner
+    bounds, parts = bounds_of(offset, np.arange(n_columns), job), []
     for start in range(0, n_frames, batch):
         part = slice(start, start + batch)
         y, x = places.corner[part, :, 0], places.corner[part, :, 1]
@@ -226,7 +228,7 @@ def fit_places(places: Places, tiles: Tiles, gain: float, job: Job) -> FrameFits
         if job.floor:
             windows -= job.floor
         limits = [values[part].reshape(-1, 7) for values in bounds]
-        fits = _fit_windows(windows.reshape(-1, *windows.shape[2:]), limits, np.arange(y.size) % n_columns, job)
+        fits = fit_windows(windows.reshape(-1, *windows.shape[2:]), limits, np.arange(y.size) % n_columns, job)
         sound = ~(places.outside[part] | places.bad[part, None])
         real = tiles.pixels.dtype.kind == "f"
         if real and (missing := ~np.isfinite(windows.sum(axis=(2, 3)).ravel()) & sound.ravel()).any():
@@ -262,7 +264,7 @@ def _fit_again(
     raw = cut_raw(tiles, first + frame, corners[frame, column] - halo, job.window_px + 2 * halo, gain) - job.floor
 
     def fit(windows: NDArray[np.float32], numbers: NDArray[np.int64]) -> FrameFits:
-        return _fit_windows(windows, [values[which[numbers]] for values in bounds], column[numbers], job)
+        return fit_windows(windows, [values[which[numbers]] for values in bounds], column[numbers], job)
 
     found, missing, lost = fit_incomplete(raw, job.settings, fit, job.full_scale_in_unit)
     lost |= missing & ~job.known[column]  # neither the place nor the shape of such a column was ever seen whole
@@ -273,70 +275,6 @@ def _fit_again(
         flags[which[lost]] = False
     for values in (fits.estimates, fits.centroid, fits.strength):
         values[which[lost]] = np.nan
-
-
-def _fit_windows(
-    windows: NDArray[np.float32], bounds: Sequence[Floats], which: NDArray[np.int64], job: Job
-) -> FrameFits:
-    """Return what windows (n, h, w) of columns ``which`` give, with start and bounds (n, 7) in their coordinates."""
-    settings, (start, lower, upper) = job.settings, bounds
-    fits = fit_gaussians(
-        windows,
-        *bounds,
-        estimator=settings.estimator,
-        fixed_shape=settings.shape == "fixed",
-        blur_sigma_px=settings.window_blur_px,
-        tolerance_px=settings.tolerance_px,
-        max_iterations=settings.max_iterations,
-        radius_px=job.window_px / 2,
-        counting=settings.counting,
-        own_noise=False,
-    )
-    fits.stderr[:] *= np.nan if settings.filters_frames else job.window_noise.errors[which]
-    fits.volume_stderr[:] *= np.nan if settings.filters_frames else job.window_noise.volume[which]
-    if settings.shape == "free":  # a sigma on its bound moves amplitude and background by more than they scatter
-        fits.stderr[fits.at_bound, AMPLITUDE] = fits.stderr[fits.at_bound, BACKGROUND] = np.nan
-        fits.volume_stderr[fits.at_bound] = np.nan
-    held, residual = np.zeros(len(windows), np.bool_), np.full(len(windows), np.nan)
-    for k in (AMPLITUDE, X, Y, BACKGROUND):
-        low, high, value = lower[:, k], upper[:, k], fits.estimates[:, k]
-        held |= np.minimum(value - low, high - value) < _AT_BOUND * (high - low)
-    if job.vacuum is None:
-        with np.errstate(invalid="ignore"):  # windows of bad frames
-            variance = windows[:, _disc(job.window_px)].var(axis=1, dtype=np.float64)
-            residual = np.sqrt((1 - fits.r_squared) * variance)
-    return FrameFits(
-        fits.estimates,
-        fits.stderr,
-        fits.volume_stderr,
-        fits.r_squared,
-        fits.n_iterations,
-        fits.converged,
-        fits.at_bound,
-        held,
-        _centroids(windows, start, which, job),
-        strengths(windows, job.filters, which).astype(np.float64),
-        residual,
-        fits.noise,
-        np.zeros(len(windows), np.bool_),
-    )
-
-
-def _centroids(windows: NDArray[np.float32], start: Floats, which: NDArray[np.int64], job: Job) -> Floats:
-    """Return the centroids of windows (n, h, w), (n, 2) rows of (y, x), in a mask that begins where the fit does.
-
-    Its radius is that with the least noise for a Gaussian with the column's width.
-    """
-    sigma = np.sqrt(job.reference[:, SIGMA_A] * job.reference[:, SIGMA_B])
-    best = np.full(len(sigma), job.settings.mask_radius_px) if job.settings.mask_radius_px else BEST_RADIUS * sigma
-    radius, dark = np.maximum(best, SMALLEST_RADIUS_PX)[which], (job.reference[:, AMPLITUDE] < 0)[which]
-    return window_centroids(windows, start[:, [X, Y]], radius, _reach(job), dark=dark).places[:, ::-1]
-
-
-def _disc(size: int) -> NDArray[np.bool_]:
-    """Return which pixels of a window count, (size, size): those no farther than half its size from the middle one."""
-    offset = np.arange(size) - size // 2
-    return np.hypot(offset[:, None], offset) <= size / 2
 
 
 def damping(job: Job) -> float:
@@ -358,36 +296,6 @@ def noise_left(sigma: float, correlation: Sequence[Sequence[float]] | None = Non
     spread = [np.convolve(row, lags) for row in np.asarray(correlation)]
     along_y = np.convolve(np.array(spread)[:, len(spread[0]) // 2], lags)
     return math.sqrt(max(0.0, float(along_y[len(along_y) // 2])))
-
-
-def _bounds(places: Places, job: Job) -> tuple[Floats, Floats, Floats]:
-    """Return start values and bounds, each (frames, columns, 7), in the coordinates of the windows."""
-    offset = places.drift[:, None] + places.displaced - places.corner  # from the summed image to the window
-    settings, reference = job.settings, job.reference
-    amplitude = settings.amplitude_factor * reference[:, AMPLITUDE]
-    span = np.abs(reference[:, BACKGROUND]) + np.abs(amplitude)
-    narrow, wide = reference[:, SIGMA_B] / settings.sigma_factor, reference[:, SIGMA_A] * settings.sigma_factor
-    bounds = {
-        AMPLITUDE: (np.minimum(0, amplitude), np.maximum(0, amplitude)),
-        SIGMA_A: (narrow, wide),
-        SIGMA_B: (narrow, wide),
-        THETA: (-np.inf, np.inf),
-        BACKGROUND: (reference[:, BACKGROUND] - span, reference[:, BACKGROUND] + span),
-    }
-    start, lower, upper = (np.empty((*offset.shape[:2], 7)) for _ in range(3))
-    start[...] = reference
-    for k, (low, high) in bounds.items():
-        lower[..., k], upper[..., k] = low, high
-    reach = _reach(job)
-    for k, shift in ((Y, offset[..., 0]), (X, offset[..., 1])):
-        start[..., k] += shift
-        lower[..., k], upper[..., k] = start[..., k] - reach, start[..., k] + reach
-    return start, lower, upper
-
-
-def _reach(job: Job) -> float:
-    """Return how far a column may be from its place in the summed image, along x and along y, px."""
-    return min(job.settings.max_shift_px or job.window_px / 4, job.window_px / 2)
 
 
 def _squares(

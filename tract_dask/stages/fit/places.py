@@ -22,6 +22,8 @@ class Places(NamedTuple):
     """Where the windows and the vacuum lie in some frames of a movie, from frame ``start`` on."""
 
     start: int
+    shape: tuple[int, ...]
+    """Rows and columns of a frame."""
     drift: Floats
     displaced: Floats
     """(frames, columns or 1, 2) how far (y, x) linear motion has carried the columns from there."""
@@ -43,15 +45,17 @@ class Places(NamedTuple):
         corner = np.rint(middle).astype(np.int64) - job.window_px // 2
         outside = np.any((corner < 0) | (corner + job.window_px > shape), axis=-1)
         lost = np.isin(np.arange(start, stop), job.lost) & ~job.bad[start:stop]
-        return cls(start, drift, displaced, job.bad[start:stop], lost, corner, outside, _vacuum(job, drift, shape))
+        return cls(
+            start, frame, drift, displaced, job.bad[start:stop], lost, corner, outside, _vacuum(job, drift, shape)
+        )
 
-    def boxes(self, job: Job, shape: tuple[int, ...]) -> NDArray[np.int64]:
-        """Return what is needed of frames of ``shape`` (y, x), as :meth:`Movie.read_tiles` takes it."""
+    def boxes(self, job: Job) -> NDArray[np.int64]:
+        """Return what is needed of the frames, as :meth:`Movie.read_tiles` takes it."""
         halo = gaussian_kernel(job.settings.noise_blur_px).size // 2
         corner = self.corner[~self.outside]
         boxes = [np.concatenate([corner - halo, corner + job.window_px + halo], axis=-1)]
         for groups in job.groups:
-            corner = group_corners(groups, self.drift, self.displaced, shape).reshape(-1, 2)
+            corner = group_corners(groups, self.drift, self.displaced, self.shape).reshape(-1, 2)
             boxes.append(np.concatenate([corner - halo, corner + np.array(groups.size) + halo], axis=-1))
         if self.vacuum is not None:
             first, side = self.vacuum[:, :2], self.vacuum[:, 2:]

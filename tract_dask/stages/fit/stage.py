@@ -22,7 +22,7 @@ from ...store.keys import counted, stage_key
 from ...store.movie import Movie
 from ...store.parts import DamagedPartError, write
 from ...store.provenance import processor, widths
-from ...store.schema import REJECTED, Status
+from ...store.schema import Status, is_accepted
 from ...store.shards import Shard
 from ..keep import Workers, is_done
 from .crystal import Crystal, judged
@@ -160,7 +160,7 @@ def _fit_task(movie: Movie, path: Path, key: str, run: Path, shard: Shard) -> Pa
     fitted = (values["status"] & Status.OUTSIDE_FRAME) == 0
     return {
         "fits": int(fitted.sum()),
-        "accepted": int(((values["status"] & REJECTED) == 0).sum()),
+        "accepted": int(is_accepted(values["status"]).sum()),
         "bad_frames": int(job.bad[shard.start : shard.stop].sum()),
         "processor": processor(),
     }
