@@ -6,6 +6,7 @@ import os
 import shutil
 import zlib
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +29,11 @@ from tract_dask.store import damage as damages
 from tract_dask.store import datasets
 from tract_dask.store import files as store_files
 from tract_dask.store import metadata as store_metadata
+from tract_dask.store.damage import store_of
 from tract_dask.store.journal import Journal, journal_beside
 from tract_dask.store.movie import open_movie
 from tract_dask.store.parts import SHARDED, write
-from tract_dask.store.results import open_results
+from tract_dask.store.results import calibrate, open_results
 from tract_dask.store.shards import split
 
 SETTINGS = RunSettings(convert=ConvertSettings(shard_mb=1, tile_px=64))
@@ -420,12 +422,88 @@ def test_shards_that_change_places_are_named(copy, first, second):
         assert Path(error.value.where) in (first, second)
 
 
+@contextmanager
+def swapped(first: Path, second: Path):
+    """Let two files change places; put them back in the end."""
+    kept = first.read_bytes(), second.read_bytes()
+    first.write_bytes(kept[1])
+    second.write_bytes(kept[0])
+    try:
+        yield
+    finally:
+        first.write_bytes(kept[0])
+        second.write_bytes(kept[1])
+
+
+def twins(run: Path) -> list[tuple[Path, Path]]:
+    """All pairs of files of a run's stores that have the same size and other bytes; of shards of an array, one pair."""
+    files: dict[int, list[Path]] = {}
+    for file in sorted(file for name in STORES for file in (run / f"{name}.zarr").rglob("*") if file.is_file()):
+        files.setdefault(file.stat().st_size, []).append(file)
+    return [
+        pair for alike in files.values() for pair in combinations(alike, 2) if len({*map(Path.read_bytes, pair)}) > 1
+    ]
+
+
+def test_no_two_files_change_places_in_silence(run):
+    """Whether arrays, chunks or metadata, of one store or of two: every checksum in them is true."""
+    pairs, wrong = twins(run), []
+    for pair in pairs:
+        with swapped(*pair):
+            for store in {store_of(file) for file in pair}:
+                names = [file.parent.name for file in pair if store in file.parents]
+                try:
+                    read_movie(store) if store.stem == "movie" else datasets.open_dataset(store, only=names)
+                    wrong.append(f"{pair}: read in silence")
+                except StoreError as error:
+                    wrong += [] if Path(error.where) in pair and error.remedy else [f"{pair}: {error}"]
+                named = {fault.file for fault in verify(store).faults}
+                wrong += (
+                    [] if named == {file for file in pair if store in file.parents} else [f"{pair}: verify {named}"]
+                )
+    assert len(pairs) > 20
+    assert wrong == []
+
+
+def test_an_array_of_another_run_in_the_place_of_ours_is_refused(copy):
+    """Stores of the same layout: only the values differ."""
+    other = datasets.open_dataset(copy / "drift.zarr")
+    other["drift"] = other["drift"] + 0.5
+    datasets.write_dataset(other, copy / "other.zarr")
+    file = copy / "drift.zarr" / "drift" / "c.0.0"
+    shutil.copy(copy / "other.zarr" / "drift" / "c.0.0", file)
+    shutil.rmtree(copy / "other.zarr")
+    with pytest.raises(StoreError, match="belongs to another place"):
+        datasets.open_dataset(copy / "drift.zarr")
+    (fault,) = verify(copy).faults
+    assert (fault.file, fault.why) == (file, "this file belongs to another place, or to another store")
+
+
+def test_a_change_of_the_times_that_is_cut_off_is_ended_by_the_next_run(copy, monkeypatch):
+    store, scale = copy / "results.zarr", {"pixel_size_pm": 8.0, "frame_time_s": 0.5, "dose": None}
+    time = np.arange(open_results(store).sizes["frame"]) * 0.5
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store_metadata, "update_attributes", killed)
+        with pytest.raises(KeyboardInterrupt):
+            calibrate(store, time, **scale)
+    assert verify(store).sound
+    calibrate(store, time, **scale)
+    np.testing.assert_array_equal(open_results(store)["time"], time)
+    with swapped(store / "time" / "c.0", store / "frame" / "c.0"), pytest.raises(StoreError):
+        open_results(store)["time"].load()
+
+
 def test_results_of_a_run_without_marks_are_read(copy):
-    """Stores of earlier releases have none."""
+    """Stores of earlier versions have none, and no list of chunks."""
     store = copy / "results.zarr"
     marked = open_results(store).load()
-    rewritten(store, lambda about: about.pop("shards_marked"))
+    rewritten(store, lambda about: (about.pop("shards_marked"), about.pop("chunks")))
     xr.testing.assert_equal(open_results(store).load(), marked)
+    assert verify(store).sound
 
 
 def test_stores_of_two_runs_in_one_folder_are_named(run, copy, tmp_path):

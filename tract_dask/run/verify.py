@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from ..store.journal import Journal, entries, journal_beside
 from ..store.locks import sole_use
 from ..store.ome import AXES, CHANGING
 from ..store.parts import SHARDED, Parts, layout
-from ..store.shard_files import ABSENT, MARKED, mark_of, read_index, unchecked
+from ..store.shard_files import ABSENT, ELSEWHERE, MARKED, mark_of, read_index, trailing, unchecked
 from ..store.strangers import WHY, advice, strangers
 from .beside import Beside, look_beside
 from .faults import STRANGE, Fault
@@ -183,9 +183,11 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
         faults.append(Fault(store / METADATA, store, stage, "damaged", why, help="Run the same command again"))
         names = [name for name in names if name not in AXES]
     key = str(about.get("key")) if about.get(MARKED) else None
+    settled = about.get("complete", True) or stage != "convert"  # coordinates of others may be half written
+    chunks = about.get(metadata.CHUNKS, {}) if settled else {}
     for name in names:
         try:
-            arrays += _Array.of(store, name, key)
+            arrays += _Array.of(store, name, key, chunks)
         except StoreError as error:
             faults.append(_fault(error, store / name / METADATA, store, stage))
     complete = bool(about.get("complete", True)) and metadata.format_of(about) >= metadata.FORMAT
@@ -270,6 +272,8 @@ class _Array:
         Whether there are checksums.
     key
         Of the store; None where its shard files have no marks.
+    chunks
+        Checksums that the store knows of chunks without marks, by their files.
     """
 
     path: Path
@@ -281,9 +285,10 @@ class _Array:
     in_frames: bool
     name: str
     key: str | None
+    chunks: Mapping[str, int]
 
     @classmethod
-    def of(cls, store: Path, name: str, key: str | None) -> list[_Array]:
+    def of(cls, store: Path, name: str, key: str | None, chunks: Mapping[str, int]) -> list[_Array]:
         """Read the metadata of an array, which are checked; none of a group."""
         about = metadata.read_node(store, name)
         if about.get("node_type") != "array":
@@ -302,6 +307,7 @@ class _Array:
             bool(axes) and axes[0] in FRAME_AXES,
             name,
             key,
+            chunks,
         )
         return [found]
 
@@ -338,7 +344,9 @@ class _Array:
             if self.tile is not None:
                 self._check_tiles(opened.fileno(), place)
             elif self.checked:
-                unchecked(memoryview(opened.read()))
+                unchecked(data := memoryview(opened.read()))
+                if self.chunks.get(f"{self.name}/{file.name}", trailing(data)) != trailing(data):
+                    raise ValueError(ELSEWHERE)
 
     def _check_tiles(self, handle: int, place: tuple[int, ...]) -> None:
         sides = self.tile or self.chunk

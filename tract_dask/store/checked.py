@@ -1,7 +1,8 @@
 """How Zarr reads the arrays of a complete store: a chunk that is missing is an error, and so is one of another place.
 
-Zarr fills a chunk that is missing with the fill value, and does not know of the marks of shard files
-(:mod:`tract_dask.store.shard_files`). Arrays that are read through :class:`CheckedPipeline` raise, and name the file.
+Zarr fills a chunk that is missing with the fill value, and does not know whose chunk a file is: that say the marks of
+shard files (:mod:`tract_dask.store.shard_files`), and the root's list of the other chunks
+(:mod:`tract_dask.store.metadata`). Arrays that are read through :class:`CheckedPipeline` raise, and name the file.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from zarr.registry import register_pipeline
 from zarr.storage import LocalStore, StorePath
 
 from .damage import METADATA, reading, store_of
-from .metadata import attributes
-from .shard_files import MARKED, mark_of, read_index
+from .metadata import CHUNKS, attributes
+from .shard_files import ELSEWHERE, MARKED, mark_of, read_index, trailing, unchecked
 
 
 class _MissingError(ValueError):
@@ -30,9 +31,10 @@ class _MissingError(ValueError):
 
 @dataclass(frozen=True)
 class _Whole:
-    """Gives the bytes of a chunk, which has to be there."""
+    """Gives the bytes of a chunk, which has to be there; those that end with its checksum, where that is known."""
 
     inner: Any
+    checksum: int | None = None
 
     async def get(self, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         found: Buffer | None = await self.inner.get(prototype, byte_range)
@@ -40,6 +42,10 @@ class _Whole:
             raise _MissingError("no such file")
         if not len(found):  # for Zarr an empty shard is one without tiles
             raise ValueError("the file is empty, or ends too early")
+        data: Any = found.as_numpy_array()
+        if self.checksum not in (None, trailing(data)):
+            unchecked(memoryview(data))
+            raise ValueError(ELSEWHERE)
         return found
 
 
@@ -54,20 +60,24 @@ class CheckedPipeline(BatchedCodecPipeline):
     """Zarr's own pipeline, but for errors: they name the file, and a chunk that is missing is one.
 
     The tiles inside a shard are read by Zarr's own: its index, which has a checksum, says where they are. The mark
-    before the index says whether the file is in its place.
+    before the index says whether the file is in its place; a chunk without an index says so by its checksum.
     """
 
     async def read(
         self, batch_info: Iterable[tuple[ByteGetter, Any, Any, Any, bool]], out: Any, drop_axes: tuple[int, ...] = ()
     ) -> None:
         """Read chunks into ``out``."""
-        items: list[Any] = [(_Whole(getter), *rest) for getter, *rest in batch_info]
+        items: list[Any] = []
+        for getter, spec, *rest in batch_info:
+            checksum, file = None, _file(getter)
+            if file is not None and isinstance(self.array_bytes_codec, ShardingCodec):
+                tiles = zip(spec.shape, self.array_bytes_codec.chunk_shape, strict=True)
+                _check_place(file, tuple(side // part for side, part in tiles))
+            elif file is not None:
+                store, about = _around(file)
+                checksum = about.get(CHUNKS, {}).get(file.relative_to(store).as_posix())
+            items.append((_Whole(getter, checksum), spec, *rest))
         files = [_file(item[0].inner) for item in items]
-        if isinstance(self.array_bytes_codec, ShardingCodec):
-            for file, (_, spec, *_) in zip(files, items, strict=True):
-                if file is not None:
-                    tiles = zip(spec.shape, self.array_bytes_codec.chunk_shape, strict=True)
-                    _check_place(file, tuple(side // part for side, part in tiles))
         try:
             await super().read(items, out, drop_axes)
         except (OSError, ValueError, RuntimeError):
@@ -92,21 +102,26 @@ def _check_place(file: Path, tiles: tuple[int, ...]) -> None:
     StoreError
         Where it is another, is damaged, or cannot be read.
     """
-    root = store_of(file) / METADATA
-    with reading(root):
-        about = root.stat()
-    key = _key_in_marks(root.parent, (about.st_ino, about.st_mtime_ns, about.st_size))
-    if key is not None:
-        array, number = file.parent.relative_to(root.parent).as_posix(), int(file.name.split(".")[1])
+    store, about = _around(file)
+    key = about.get("key") if about.get(MARKED) else None
+    if key:
+        array, number = file.parent.relative_to(store).as_posix(), int(file.name.split(".")[1])
         with reading(file), file.open("rb", buffering=0) as opened:
             read_index(opened.fileno(), tiles, mark_of(key, array, number))
 
 
+def _around(file: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the store that a chunk's file is part of, and what the store says of itself."""
+    root = store_of(file) / METADATA
+    with reading(root):
+        state = root.stat()
+    return root.parent, _said(root.parent, (state.st_ino, state.st_mtime_ns, state.st_size))
+
+
 @lru_cache(64)
-def _key_in_marks(store: Path, state: tuple[int, ...]) -> str | None:
-    """Return the key in the marks of a store's shard files, known while its root's state is; None without marks."""
-    about = attributes(store)
-    return about.get("key") or None if about.get(MARKED) else None
+def _said(store: Path, state: tuple[int, ...]) -> dict[str, Any]:
+    """Return what a store says of itself, known while its root's state is."""
+    return attributes(store)
 
 
 register_pipeline(CheckedPipeline)

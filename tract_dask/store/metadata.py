@@ -16,13 +16,16 @@ from ..errors import DestinationError, MissingStoreError, StoreError, TractError
 from .damage import METADATA, damaged, read_json
 from .files import write_aside
 from .held import check_held
-from .shard_files import crc32c
+from .shard_files import CHECKSUM_BYTES, crc32c, trailing
 
 ATTRIBUTE = "tract_dask"
 """Name of the attribute under which every store keeps its provenance and its own metadata."""
 
 FORMAT = 2
 """Number of the format in which stores are written. In format 1 chunks had no checksums, and stores no number."""
+
+CHUNKS = "chunks"
+"""Attribute that names the files of the chunks without marks, each with its checksum: none can change places."""
 
 _MARKS = ("frame_bad_pixels", "fit_ref", "quality", "exposure")
 """Arrays by which our stores are known where they do not say what they are."""
@@ -119,17 +122,20 @@ def format_of(about: Mapping[str, Any]) -> int:
         return 1  # where it was the format of a movie's source, in words
 
 
-def update_attributes(path: Path, *, plain: Mapping[str, Any] | None = None, **changes: Any) -> None:
+def update_attributes(
+    path: Path, *, plain: Mapping[str, Any] | None = None, changed: Collection[str] = (), **changes: Any
+) -> None:
     """Change what the store at ``path`` says of itself; written aside, then renamed.
 
-    ``plain`` are attributes that stand beside :data:`ATTRIBUTE`, for other readers.
+    ``plain`` are attributes that stand beside :data:`ATTRIBUTE`, for other readers; ``changed`` are arrays that have
+    been written anew.
     """
     attributes(path)  # refuses one that is damaged
     metadata = read_json(path / METADATA)
     known = metadata.setdefault("attributes", {})
     known.update(plain or {})
     known.setdefault(ATTRIBUTE, {}).update(changes)
-    write_root(path, metadata)
+    write_root(path, metadata, changed)
 
 
 def write_root(path: Path, metadata: dict[str, Any], changed: Collection[str] = ()) -> None:
@@ -138,12 +144,13 @@ def write_root(path: Path, metadata: dict[str, Any], changed: Collection[str] = 
     Parameters
     ----------
     changed
-        Arrays whose metadata have changed since the root was last written; of all where that was never.
+        Arrays whose metadata or chunks have changed since the root was last written; all where that was never.
     """
     ours = metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {})
     known = ours.get("arrays")
-    names = node_names(path) if known is None else changed
+    names = list(node_names(path)) if known is None else changed
     ours["arrays"] = (known or {}) | {name: digest(read_json(path / name / METADATA)) for name in names}
+    ours[CHUNKS] = dict(sorted((_others(ours, names) | _checksums(path, names)).items()))
     ours["format"] = FORMAT
     ours.pop("checksum", None)
     metadata = json_ready(metadata)
@@ -152,10 +159,39 @@ def write_root(path: Path, metadata: dict[str, Any], changed: Collection[str] = 
     write_aside(path / METADATA, json.dumps(metadata).encode())
 
 
-def seal(path: Path) -> None:
-    """Give a new store the number of the format and checksums of the metadata of all its arrays."""
+def _others(about: Mapping[str, Any], names: Collection[str]) -> dict[str, int]:
+    """Return the checksums of chunks that a store names, but for those of some arrays."""
+    known = about.get(CHUNKS, {})
+    return {file: checksum for file, checksum in known.items() if file.rpartition("/")[0] not in names}
+
+
+def _checksums(path: Path, names: Iterable[str]) -> dict[str, int]:
+    """Return the checksum behind each chunk of some arrays, by its file; those in shards have marks instead."""
+    found = {}
+    for name in names:
+        codecs = read_json(path / name / METADATA).get("codecs", ())
+        if codecs and codecs[-1]["name"] == "crc32c":
+            for file in (path / name).glob("c*"):
+                with file.open("rb", buffering=0) as opened:
+                    opened.seek(max(0, file.stat().st_size - CHECKSUM_BYTES))
+                    found[f"{name}/{file.name}"] = trailing(opened.read())
+    return found
+
+
+def forget(path: Path, names: Collection[str]) -> None:
+    """Take the chunks of some arrays out of what a store knows, before they are written anew: that may be cut off."""
     metadata = read_json(path / METADATA)
-    metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {}).pop("arrays", None)
+    ours = metadata.get("attributes", {}).get(ATTRIBUTE, {})
+    ours[CHUNKS] = _others(ours, names)
+    write_root(path, metadata)
+
+
+def seal(path: Path) -> None:
+    """Give a new store the number of the format, and checksums of the metadata and of the chunks of all its arrays."""
+    metadata = read_json(path / METADATA)
+    ours = metadata.setdefault("attributes", {}).setdefault(ATTRIBUTE, {})
+    ours.pop("arrays", None)
+    ours.pop(CHUNKS, None)
     write_root(path, metadata)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,10 @@ CHANGING = "changing"
 """Attribute that a movie has while its coordinates and its calibration are changed, and where that was cut off."""
 
 
-def write_metadata(path: Path, ours: dict[str, Any]) -> None:
+def write_metadata(path: Path, ours: dict[str, Any], changed: Collection[str] = ()) -> None:
     """Write the coordinates, then what the root says, in one rename: OME-Zarr's attributes and our own.
+
+    ``changed`` are other arrays that have been written anew.
 
     Raises
     ------
@@ -45,7 +47,7 @@ def write_metadata(path: Path, ours: dict[str, Any]) -> None:
     }
     nodes = _nodes(path, (*map(frame_array, ours.get("frame_values", ())), *nodes_of(ours)))
     root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": nodes}
-    metadata.write_root(path, root, changed=(*AXES, *nodes_of(ours)))
+    metadata.write_root(path, root, changed=(*AXES, *changed))
 
 
 def frame_array(name: str) -> str:

@@ -143,9 +143,11 @@ def calibrate(path: Path, time: np.ndarray[Any, Any], **about: Any) -> None:
     """Bring a finished store's calibration up to date: times of the frames, and what its pixels mean."""
     present = metadata.attributes(path)
     same = np.array_equal(np.asarray(datasets.open_dataset(path, only=("time",))["time"]), time)
-    if not same or any(present.get(name) != value for name, value in about.items()):
+    known = any(file.startswith("time/") for file in present.get(metadata.CHUNKS, ()))  # unless this was cut off
+    if not (same and known) or any(present.get(name) != value for name, value in about.items()):
+        metadata.forget(path, ["time"])
         datasets.overwrite_array(path / "time", time)
-        metadata.update_attributes(path, plain=about, **about)
+        metadata.update_attributes(path, plain=about, changed=["time"], **about)
 
 
 def finished_shards(path: Path) -> np.ndarray[Any, np.dtype[np.bool_]]:

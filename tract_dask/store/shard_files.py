@@ -121,6 +121,15 @@ def unchecked(data: memoryview) -> memoryview:
     return inner
 
 
+def trailing(data: Any) -> int:
+    """Return the CRC-32C that is written behind contiguous data, as a number; it is not checked."""
+    return int.from_bytes(bytes(data[-CHECKSUM_BYTES:]), "little")
+
+
+ELSEWHERE = "this file belongs to another place, or to another store"
+"""What is wrong with a sound file that is not the one of its place."""
+
+
 def encode(values: Pixels, codec: str, into: NDArray[np.uint8] | None = None) -> Any:
     """Return the bytes of a contiguous array, encoded; in the memory of ``into`` where it is given and used."""
     if codec not in BLOSC:
@@ -257,7 +266,7 @@ def read_index(handle: int, tiles: tuple[int, ...], mark: bytes = b"") -> NDArra
     except ValueError as error:
         raise ValueError("the index at the end is damaged") from error
     if tail[: len(mark)] != mark:
-        raise ValueError("this file belongs to another place, or to another store")
+        raise ValueError(ELSEWHERE)
     return index
 
 

@@ -14,7 +14,7 @@ from ...readers.source import SourceMetadata
 from ...settings.run import MetadataSettings
 from ...store import datasets, disk, files, schema
 from ...store.layout import LEVEL_DTYPE, Layout
-from ...store.metadata import attributes, update_attributes
+from ...store.metadata import attributes, forget, update_attributes
 from ...store.ome import AXES, CHANGING, frame_array, write_metadata
 from ...store.pixels import GROUP, NO_PIXELS, Pixels, nodes_of
 from ...store.shard_files import CHUNK_KEYS, MARKED, Grid, codecs
@@ -103,16 +103,19 @@ def _create_vector(path: Path, length: int, axis: str, dtype: str, attributes: d
 
 
 def finalise(
-    path: Path, statistics: dict[str, NDArray[np.float64]], known: SourceMetadata, pixels: Pixels = NO_PIXELS
+    path: Path, along_frames: dict[str, NDArray[np.float64]], known: SourceMetadata, pixels: Pixels = NO_PIXELS
 ) -> None:
-    """Write the statistics (frames,), the pixels without data and the metadata, and say that the store is complete."""
+    """Write arrays (frames,) such as the statistics, the pixels without data and the metadata; say: it is complete."""
+    present = attributes(path)
     with files.disk_errors(path):
-        for name, values in statistics.items():
+        if present["complete"]:  # it is repaired
+            forget(path, present.get("arrays", ()))
+        for name, values in along_frames.items():
             datasets.overwrite_array(path / name, values)
-        present = attributes(path)
         left_out = pixels.write(path, present["shape"][1:])
-        disk.sync_folders(path, (*statistics, *nodes_of({GROUP: left_out})))
-        write_metadata(path, present | quantities(known) | {GROUP: left_out, "complete": True})
+        written = (*along_frames, *nodes_of({GROUP: left_out}))
+        disk.sync_folders(path, written)
+        write_metadata(path, present | quantities(known) | {GROUP: left_out, "complete": True}, written)
 
 
 def quantities(metadata: SourceMetadata | MetadataSettings) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from ...readers.selection import overridden
 from ...readers.source import FrameSource, SourceMetadata
 from ...settings.run import ConvertSettings, MetadataSettings, RunSettings, SourceSettings
 from ...settings.toml import from_toml, to_toml
-from ...store import datasets, disk, schema
+from ...store import disk, schema
 from ...store.files import disk_errors, remove
 from ...store.held import Folder, hold
 from ...store.journal import Journal, Payload, journal_beside, remove_journal
@@ -264,9 +264,9 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
                 values[shard.start : shard.stop] = payload[name]
             on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
-        for name in about.get("frame_values", ()):
-            datasets.overwrite_array(path / frame_array(name), source.metadata.along_frames[name].values)
-        finalise(path, statistics, SourceMetadata(**_said(about)), gathered.pixels(finder))
+        known = source.metadata.along_frames
+        values = {frame_array(name): known[name].values for name in about.get("frame_values", ())}
+        finalise(path, statistics | values, SourceMetadata(**_said(about)), gathered.pixels(finder))
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
 
 
