@@ -16,13 +16,14 @@ from files_dm import write_dm
 
 from tract_dask import convert, estimate_drift, fit_columns, open_movie, sum_image
 from tract_dask.errors import DestinationError, MissingSourceError, SettingsError, SourceError
+from tract_dask.progress import Warned
 from tract_dask.readers import open_source
 from tract_dask.run.inspect import describe
 from tract_dask.run.verify import repair, verify
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, SourceSettings
 from tract_dask.stages.convert.defects import finder_for
 from tract_dask.stages.convert.origin import is_converted, movie_key, remembered_source
-from tract_dask.stages.convert.references import check_references, read_references
+from tract_dask.stages.convert.references import check_references, read_references, without_effect
 from tract_dask.stages.convert.stage import remake
 from tract_dask.store.schema import REJECTED
 
@@ -195,6 +196,12 @@ def test_defects_as_a_list(camera, tmp_path, text):
         ("dark", np.zeros((144, 160)), "Turn it by 90 degrees"),
         ("gain_reference", np.zeros((160, 144)), "not above 0"),
         ("defects", np.ones((160, 144), bool), "the other way round"),
+        ("dark", np.full((160, 144), np.nan), "dark image holds no numbers at most pixels.*leave it out"),
+        ("dark", np.full((160, 144), np.inf), "dark image holds no numbers at most pixels"),
+        ("gain_reference", np.full((160, 144), np.nan), "most pixels of the gain reference are not above 0"),
+        ("defects", np.full((160, 144), np.nan), "leaves out most pixels"),
+        ("dark", np.zeros((0, 160, 144)), "no frames"),
+        ("gain_reference", np.zeros((1, 0, 0)), "wrong.npy"),
     ],
 )
 def test_what_does_not_fit_is_refused(camera, tmp_path, option, values, words):
@@ -202,6 +209,38 @@ def test_what_does_not_fit_is_refused(camera, tmp_path, option, values, words):
     settings = ConvertSettings(**LAYOUT, **{option: str(tmp_path / "wrong.npy")})
     with pytest.raises(SourceError, match=words):
         convert(camera.path("movie"), tmp_path / "movie.zarr", settings=settings)
+
+
+def test_references_that_leave_out_most_pixels_together_are_refused(camera):
+    image = np.ones(camera.scene.shape, np.float32)
+    camera.save("half dark", np.where(np.arange(160)[:, None] < 60, np.nan, image))
+    camera.save("half faulty", np.arange(160)[:, None] + 0 * image > 100)
+    settings = ConvertSettings(dark=camera.path("half dark"), defects=camera.path("half faulty"))
+    with pytest.raises(SourceError, match=r"leave out most pixels.*26%"):
+        read_references(open_source(camera.path("movie")), settings)
+    (camera.folder / "all.csv").write_text("".join(f"{x},{y}\n" for x in range(144) for y in range(160)))
+    with pytest.raises(SourceError, match=r"all\.csv: the references leave out most pixels"):
+        read_references(open_source(camera.path("movie")), ConvertSettings(defects=str(camera.folder / "all.csv")))
+
+
+def test_references_of_one_value_and_empty_lists_are_named(camera, tmp_path):
+    (tmp_path / "none.csv").write_text("x,y\n")
+    camera.save("level", np.full(camera.scene.shape, 100, np.uint16))
+    camera.save("ones", np.ones(camera.scene.shape, np.float32))
+    camera.save("zeros", np.zeros(camera.scene.shape, np.float32))
+    told = []
+    settings = ConvertSettings(
+        **LAYOUT, dark=camera.path("level"), gain_reference=camera.path("ones"), defects=str(tmp_path / "none.csv")
+    )
+    convert(camera.path("movie"), tmp_path / "movie.zarr", settings=settings, on_event=told.append)
+    words = [event.message for event in told if isinstance(event, Warned)]
+    assert any("level.npy has one value 100 everywhere: it lowers all pixels alike" in said for said in words)
+    assert any("ones.npy has one value everywhere: it changes no pixel" in said for said in words)
+    assert any("none.csv names no pixel of the frames" in said for said in words)
+    zeros = ConvertSettings(dark=camera.path("zeros"))
+    (said,) = without_effect(zeros, read_references(open_source(camera.path("movie")), zeros))
+    assert "zeros.npy has one value 0 everywhere: it changes no pixel" in said
+    assert without_effect(camera.settings, read_references(open_source(camera.path("movie")), camera.settings)) == []
 
 
 @pytest.mark.parametrize(

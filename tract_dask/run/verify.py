@@ -182,12 +182,9 @@ def _verify_store(store: Path, on_event: Sink) -> Verified:
         why = "its pixel size or frame time is being changed, or that was cut off"
         faults.append(Fault(store / METADATA, store, stage, "damaged", why, help="Run the same command again"))
         names = [name for name in names if name not in AXES]
-    key = str(about.get("key")) if about.get(MARKED) else None
-    settled = about.get("complete", True) or stage != "convert"  # coordinates of others may be half written
-    chunks = about.get(metadata.CHUNKS, {}) if settled else {}
     for name in names:
         try:
-            arrays += _Array.of(store, name, key, chunks)
+            arrays += _Array.of(store, name, about)
         except StoreError as error:
             faults.append(_fault(error, store / name / METADATA, store, stage))
     complete = bool(about.get("complete", True)) and metadata.format_of(about) >= metadata.FORMAT
@@ -288,8 +285,8 @@ class _Array:
     chunks: Mapping[str, int]
 
     @classmethod
-    def of(cls, store: Path, name: str, key: str | None, chunks: Mapping[str, int]) -> list[_Array]:
-        """Read the metadata of an array, which are checked; none of a group."""
+    def of(cls, store: Path, name: str, said: Mapping[str, Any]) -> list[_Array]:
+        """Read the metadata of an array, which are checked; none of a group. ``said`` is what the store says."""
         about = metadata.read_node(store, name)
         if about.get("node_type") != "array":
             return []
@@ -297,6 +294,7 @@ class _Array:
         sharding = codecs.get("sharding_indexed")
         inner = sharding["codecs"] if sharding else about["codecs"]
         axes = about.get("dimension_names") or [None]
+        settled = said.get("complete", True) or said.get("kind") != "movie"  # else coordinates may be half written
         found = cls(
             store / name,
             tuple(about["shape"]),
@@ -306,8 +304,8 @@ class _Array:
             any(codec["name"] == "crc32c" for codec in inner),
             bool(axes) and axes[0] in FRAME_AXES,
             name,
-            key,
-            chunks,
+            str(said.get("key")) if said.get(MARKED) else None,
+            said.get(metadata.CHUNKS, {}) if settled else {},
         )
         return [found]
 

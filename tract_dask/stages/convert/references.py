@@ -27,6 +27,9 @@ from .reference_files import check_reference, content_of_reference, in_part, rea
 NAMES = ("dark", "gain_reference", "defects")
 """The settings that name references."""
 
+_MOST = 0.5
+"""References that leave out a larger share of the pixels are refused."""
+
 _UNLIKE = 4.0
 """A pixel whose sensitivity differs so many times from the usual one is faulty."""
 
@@ -138,21 +141,52 @@ def read_references(movie: FrameSource, settings: ConvertSettings) -> Pixels:
         faulty |= in_part(read_defects(settings.defects, movie), movie).any(axis=2)
     if settings.dark is not None:
         level = in_part(read_reference(settings.dark, movie), movie).sum(axis=2)
-        faulty |= ~np.isfinite(level)
+        unknown = ~np.isfinite(level)
+        _check_share(unknown, settings.dark, "the dark image holds no numbers at most pixels", "numbers")
+        faulty |= unknown
         dark = np.where(np.isfinite(level), level, 0).astype(np.float32)
     if settings.gain_reference is not None:
         image = read_reference(settings.gain_reference, movie)
         found = in_part(sensitivity(image, settings.gain_reference, settings.gain_reference_by), movie)
         faulty |= np.isnan(found).any(axis=2)
         gain = np.where(faulty, 1, 1 / np.where(faulty, 1, found.mean(axis=2))).astype(np.float32)
+    _check_share(faulty, ", ".join(given(settings).values()), "the references leave out most pixels", "good pixels")
     mask = np.where(faulty, np.uint8(USER), np.uint8(0)) if faulty.any() else None
     return Pixels(mask=mask, dark=dark, gain=gain)
+
+
+def _check_share(faulty: NDArray[np.bool_], place: str, what: str, expected: str) -> None:
+    if faulty.mean() > _MOST:
+        remedy = "Give the reference of this camera, or leave it out"
+        raise SourceError(what, place, f"{expected} at half of the pixels or more", f"{1 - faulty.mean():.0%}", remedy)
+
+
+def without_effect(settings: ConvertSettings, pixels: Pixels) -> list[str]:
+    """Return sentences on references that are given and correct nothing, or nothing but the level.
+
+    Parameters
+    ----------
+    pixels
+        What a movie's store keeps, of :func:`read_references` among other things.
+    """
+    good = np.bool_(True) if pixels.mask is None else pixels.mask == 0
+    found = []
+    for name, place in given(settings).items():
+        values = {"dark": pixels.dark, "gain_reference": pixels.gain}.get(name)
+        if name == "defects" and (pixels.mask is None or not (pixels.mask == USER).any()):
+            found.append(f"{place} names no pixel of the frames: no pixel is left out by it")
+        elif values is not None and (one := values[np.broadcast_to(good, values.shape)]).size and np.ptp(one) == 0:
+            level = name == "dark" and one[0] != 0
+            effect = "it lowers all pixels alike" if level else "it changes no pixel"
+            said = f" {one[0]:g}" if name == "dark" else ""
+            found.append(f"{place} has one value{said} everywhere: {effect}. Is it the right reference?")
+    return found
 
 
 def sensitivity(image: NDArray[np.float64], place: str, by: str) -> NDArray[np.float64]:
     """Return the sensitivity of pixels, of mean 1; NaN where a pixel has none, or one that is out of all proportion."""
     good = np.isfinite(image) & (image > 0)
-    if good.mean() < 0.5:
+    if good.mean() < 1 - _MOST:
         raise SourceError(
             "most pixels of the gain reference are not above 0",
             place,

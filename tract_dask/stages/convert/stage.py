@@ -59,7 +59,7 @@ from .origin import (
     origin_of,
     remembered,
 )
-from .references import applied_by, check_references, contents, given, with_whole_paths
+from .references import applied_by, check_references, contents, given, with_whole_paths, without_effect
 from .shard import Job, convert_shard
 
 
@@ -132,7 +132,7 @@ def convert(
         finalise(path, statistics, known, pixels)
         update_metadata(path, known, to_measure=_to_measure(metadata))
     journal.remove()
-    corrected = [f"corrected by {' and '.join(options)}"] if (options := applied_by(settings)) else []
+    corrected = _corrections(settings, pixels, on_event)
     words = [f"{n_frames} frames in {len(shards)} shards", *corrected, *in_words(pixels.counts((n_y, n_x)))]
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=", ".join(words)))
     return path
@@ -153,6 +153,13 @@ def _known(
         if not any(option in note for option in options):
             on_event(Warned(note))
     return known if settings.dark is None else replace(known, offset=0.0)
+
+
+def _corrections(settings: ConvertSettings, pixels: Pixels, on_event: Sink) -> list[str]:
+    """Return in words which references corrected the frames; warn of those that change nothing."""
+    for sentence in without_effect(settings, pixels):
+        on_event(Warned(sentence))
+    return [f"corrected by {' and '.join(options)}"] if (options := applied_by(settings)) else []
 
 
 def _to_measure(metadata: MetadataSettings) -> list[str]:
@@ -265,8 +272,8 @@ def remake(path: Path, shards: Collection[int], *, everything: bool = False, on_
             on_event(ShardDone(STAGE, shard.index, shard.frames))
     if everything:
         known = source.metadata.along_frames
-        values = {frame_array(name): known[name].values for name in about.get("frame_values", ())}
-        finalise(path, statistics | values, SourceMetadata(**_said(about)), gathered.pixels(finder))
+        statistics |= {frame_array(name): known[name].values for name in about.get("frame_values", ())}
+        finalise(path, statistics, SourceMetadata(**_said(about)), gathered.pixels(finder))
     on_event(StageDone(STAGE, time.perf_counter() - started, summary=f"{len(chosen)} shards made again"))
 
 
