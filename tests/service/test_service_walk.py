@@ -23,7 +23,7 @@ def test_a_new_user_goes_from_a_movie_to_a_dataset(tmp_path):
         n_ce=truth["atoms"],
     )
     walked = subprocess.run(
-        [sys.executable, SCRIPTS / "service_walk", tmp_path / "movie.tif", tmp_path / "walk"],
+        [sys.executable, SCRIPTS / "service_walk", tmp_path / "movie.tif", tmp_path / "walk", "--no-pictures"],
         capture_output=True,
         text=True,
         timeout=540,
