@@ -831,6 +831,17 @@ def touching_run(folder, apart_px, error_px=ERROR_PX, group=(1, 1), **fit):
     return {finding.name: finding for finding in findings(survey(run.write(), []))}
 
 
+def test_sublattices_that_were_left_out_are_told(tmp_path):
+    run = Run(tmp_path)
+    near = {"why": "near", "number": 48, "cell": [0.5, 0.25], "distance_px": 17.4, "share": None}
+    faint = {"why": "faint", "number": 40, "cell": [0.5, 0.5], "distance_px": 28.0, "share": 0.11}
+    run.found = {"left_out": [near, faint]}
+    found = {finding.name: finding for finding in findings(survey(run.write(), []))}["left_out"]
+    assert not found.serious
+    assert all(part in found.text for part in ("48 places", "17.4 px", "40 columns", "11%"))
+    assert "--min-amplitude" in found.remedy
+
+
 def test_touching_columns_that_were_fitted_alone_are_told(tmp_path):
     together, likely, given = (tmp_path / name for name in ("together", "likely", "given"))
     for folder in (together, likely, given):

@@ -36,6 +36,33 @@ def slip_words(run: Survey) -> dict[str, Any] | None:
     }
 
 
+def left_out_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of sublattices that were seen and left out; None where none was."""
+    left = run.found.get("left_out")
+    if not left:
+        return None
+    near = [one for one in left if one["why"] == "near"]
+    faint = [one for one in left if one["why"] == "faint"]
+    sentences = []
+    if near:
+        number, nearest = sum(one["number"] for one in near), min(one["distance_px"] for one in near)
+        sentences.append(
+            f"{number:,} places that come back in every cell are {nearest:.3g} px from brighter columns, too near for "
+            "columns that are fitted with as large windows."
+        )
+    if faint:
+        number, share = sum(one["number"] for one in faint), max(one["share"] for one in faint)
+        sentences.append(f"{number:,} columns of fainter kinds have {share:.0%} of the amplitude of the others.")
+    remedies = ["Give --min-amplitude below that share to have the faint ones."] if faint else []
+    remedies += ["Near ones are found by --columns-method maxima, or given in a table (--columns-csv)."] if near else []
+    return {
+        "title": "Faint columns between the others were left out",
+        "text": " ".join(sentences),
+        "remedy": " ".join(remedies),
+        "serious": False,
+    }
+
+
 def motion_words(run: Survey) -> dict[str, Any] | None:
     """Return what there is to say of a crystal that turned, grew or sheared; None where none did."""
     undone = run.about.get("motions_undone")

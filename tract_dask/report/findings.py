@@ -15,7 +15,7 @@ from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
 from .camera import camera_findings, faint_words, pattern_words
-from .crystal import motion_words, slip_words
+from .crystal import left_out_words, motion_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
 from .touching import alone_words, unresolved_words
@@ -380,6 +380,8 @@ def _spacing(run: Survey) -> float | None:
 
 
 def _crystal(run: Survey) -> Iterator[Finding]:
+    if words := left_out_words(run):
+        yield Finding("left_out", **words)
     if words := motion_words(run):
         yield Finding("crystal_motion", **words)
     if words := slip_words(run):

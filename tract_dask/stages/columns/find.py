@@ -15,13 +15,15 @@ from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv
 from .contrast import SIGNS, chosen, support
 from .detect import METHODS, make_detector
-from .grouping import grouped, same_column_px
+from .grouping import Grouped, grouped, same_column_px
+from .kinds import kinds_of
 from .lattice import Lattice, find_peaks
 from .relief import Places
 from .scene import Scene, scene_of
 from .singles import Fits, Seeds, fitted_alone
 from .sites import lattice_sites
 from .slopes import drawn_by_slopes
+from .sublattices import Extended, LeftOut, told, with_fainter
 from .twins import twins_of
 from .window_size import neighbour_distance, usual_sigma
 
@@ -50,7 +52,8 @@ def find_columns(
 ) -> xr.Dataset:
     """Find the atomic columns of the summed image and fit each of them (section 2.4 of the paper).
 
-    Seeds come from the image (method ``auto``, see :func:`tract_dask.stages.columns.lattice.find_peaks`), from lattices
+    Seeds come from the image (method ``auto``, see :func:`tract_dask.stages.columns.lattice.find_peaks`, and
+    :mod:`tract_dask.stages.columns.sublattices` for fainter kinds), from lattices
     of three atoms (``lattice``, see :func:`tract_dask.lattice_columns`), from a file (``csv``), or are what stands out
     of the noise (``maxima``, ``blobs``, ``template``, see :mod:`tract_dask.stages.columns.detect`). Each moves to the
     local maximum within the search radius, then to the centroid around that, and there Equation 1 is fitted.
@@ -72,7 +75,8 @@ def find_columns(
     Returns
     -------
     xr.Dataset
-        As declared in :data:`schema.COLUMNS`. Columns found automatically or on lattices are numbered from 1, row by
+        As declared in :data:`schema.COLUMNS`; ``kind`` is that of :func:`tract_dask.stages.columns.kinds.kinds_of`
+        where it was not given. Columns found automatically or on lattices are numbered from 1, row by
         row from the top and by x within a row (the columns no more than a third of the spacing below a row's first);
         those from a file or ``seeds`` keep their order and IDs. A column whose window leaves the exposed part of the
         image is kept where its seed was, with the flag outside_frame and without a fit. Attributes: spacing_px (median
@@ -80,9 +84,11 @@ def find_columns(
         support that the other one has, see :mod:`tract_dask.stages.columns.contrast`; None where it was set),
         lattice_px (shortest period of the image; None where it has none, and for columns that were given),
         blur_sigma_px, sigma_px (the columns' median sigma without that blur), rounding_variance_px2 (of the summed
-        image), pixel_size_pm, n_seeds, and merged: pairs of a column's ID and the number of a later seed that refined
-        to the same column and was dropped. (A seed's number is its ID, or its place in the list of seeds, from 1:
-        automatic ones strongest first, those of lattices lattice by lattice, without sites beyond the image.)
+        image), pixel_size_pm, n_seeds, left_out (sublattices that were seen and not taken, see
+        :class:`tract_dask.stages.columns.sublattices.LeftOut`), and merged: pairs of a column's ID and the number of a
+        later seed that refined to the same column and was dropped. (A seed's number is its ID, or its place in the list
+        of seeds, from 1: automatic ones strongest first, those of lattices lattice by lattice, without sites beyond the
+        image.)
 
     Raises
     ------
@@ -96,24 +102,19 @@ def find_columns(
     scene = scene_of(summed, blur_sigma_px)
     chosen_one, rival = _by_contrast(scene, settings, seeds, window_px)
     own = scene if chosen_one.contrast == "bright" else scene.dark
-    best = grouped(own, settings, chosen_one.seeds, chosen_one.spacing, chosen_one.fits, window_px)
+    best, left_out = _with_others(own, settings, chosen_one, window_px, given=seeds is not None)
     fits, found = best.fits, best.seeds
-    fit = fits.fit.copy()
-    fit[:, [AMPLITUDE, BACKGROUND]] *= scene.unit
-    if seeds is not None and "share" in seeds:
-        fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
-    fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
-    alone = (fits.status == 0) & (best.groups == 0)
-    fit[:, [X, Y]] -= drawn_by_slopes(np.where(alone[:, None], fit, np.nan), fits.window_px)
+    fit = _in_counts(best, scene, summed, seeds)
     places = np.where(np.isfinite(fit[:, [X, Y]]), fit[:, [X, Y]], fits.places)
     twins = twins_of(places, same_column_px(places, best.groups, _SAME * best.spacing))
     kept = np.setdiff1d(np.arange(len(places)), list(twins))
     kept = kept if found.fixed else kept[_reading_order(places[kept], best.spacing / 3)]
     ids = found.number[kept] if found.fixed else np.arange(1, len(kept) + 1)
     groups = _numbered(best.groups[kept])
-    columns = column_dataset(places[kept], found.kind[kept].tolist(), ids, fit[kept], fits.status[kept], groups)
-    name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
     lattice = scene.lattice() if seeds is None and settings.method in ("auto", *METHODS) else None
+    kinds = found.kind[kept] if lattice is None else kinds_of(places[kept], fit[kept, AMPLITUDE], lattice)
+    columns = column_dataset(places[kept], kinds.tolist(), ids, fit[kept], fits.status[kept], groups)
+    name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
     columns.attrs = {
         "spacing_px": best.spacing if groups.any() else neighbour_distance(places[kept]) or best.spacing,
         "window_px": fits.window_px,
@@ -125,9 +126,34 @@ def find_columns(
         "rounding_variance_px2": summed.attrs.get("rounding_variance_px2", 0.0),
         "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
         "n_seeds": len(found.number),
+        "left_out": told(left_out, places[kept]),
         "merged": sorted([name[first], int(found.number[twin])] for twin, first in twins.items()),
     }
     return columns
+
+
+def _in_counts(best: Grouped, scene: Scene, summed: xr.Dataset, seeds: xr.Dataset | None) -> Places:
+    """Return fits (n, 7) in counts, where the columns are."""
+    fit = best.fits.fit.copy()
+    fit[:, [AMPLITUDE, BACKGROUND]] *= scene.unit
+    if seeds is not None and "share" in seeds:
+        fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
+    fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
+    alone = (best.fits.status == 0) & (best.groups == 0)
+    fit[:, [X, Y]] -= drawn_by_slopes(np.where(alone[:, None], fit, np.nan), best.fits.window_px)
+    return fit
+
+
+def _with_others(
+    scene: Scene, settings: ColumnSettings, found: _Found, window_px: int | None, *, given: bool
+) -> tuple[Grouped, list[LeftOut]]:
+    """Return the columns with those of fainter sublattices and those that touch, and sublattices that were left out."""
+    more = Extended(found.seeds, found.spacing, found.fits, [], window_px)
+    if not given and settings.method == "auto":
+        more = with_fainter(scene, settings, found.seeds, found.spacing, found.fits, window_px)
+    crowded = len(more.seeds.places) > len(found.seeds.places)
+    best = grouped(scene, settings, more.seeds, more.spacing, more.fits, more.window_px, crowded=crowded)
+    return best, more.left_out
 
 
 def _by_contrast(

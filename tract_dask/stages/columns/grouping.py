@@ -38,7 +38,14 @@ class Grouped:
 
 
 def grouped(
-    scene: Scene, settings: ColumnSettings, seeds: Seeds, spacing: float, fits: Fits, window_px: int | None
+    scene: Scene,
+    settings: ColumnSettings,
+    seeds: Seeds,
+    spacing: float,
+    fits: Fits,
+    window_px: int | None,
+    *,
+    crowded: bool = False,
 ) -> Grouped:
     """Return the columns with their groups, and with those that were missed.
 
@@ -51,10 +58,12 @@ def grouped(
         Distance of the columns, px, and their fits, each alone.
     window_px
         As it was given; None: half the distance of blobs.
+    crowded
+        Columns of several sublattices are nearer to each other than lattice vectors are long.
     """
     columns = _without_twins(fits, spacing)
     if not seeds.fixed and np.isfinite(columns).all(axis=1).any():
-        columns, more, more_fits = _with_missed(scene, seeds, spacing, fits, columns)
+        columns, more, more_fits = _with_missed(scene, seeds, spacing, fits, columns, crowded)
     else:
         more, more_fits = seeds, fits
     groups = groups_of(_narrow(columns))
@@ -79,11 +88,13 @@ def grouped(
     return Grouped(here, spacing, replace(alone, fit=whole_fit, status=flags.astype(np.uint8)), final)
 
 
-def _with_missed(scene: Scene, seeds: Seeds, spacing: float, fits: Fits, columns: Floats) -> tuple[Floats, Seeds, Fits]:
+def _with_missed(
+    scene: Scene, seeds: Seeds, spacing: float, fits: Fits, columns: Floats, crowded: bool
+) -> tuple[Floats, Seeds, Fits]:
     """Return columns (n, 7), seeds and fits with the columns that were missed beside those that were found."""
     variance = blur_variance(fits.blur_sigma_px)
     lattice = next(iter(scene.lattices.values()), None)
-    cell = max(spacing, lattice.spacing) if lattice else spacing
+    cell = max(spacing, lattice.spacing) if lattice and not crowded else spacing
     image = Image(scene.counts, scene.known, scene.noise, scene.sign)
     found, parent = touching_columns(image, blurred(columns, -variance), cell / 2)
     n, added = len(columns), len(found) - len(columns)

@@ -203,6 +203,18 @@ def without_holes(there: Mask) -> Mask:
     return whole
 
 
+def peaks_of(relief: Relief, spacing: float) -> tuple[Places, Reals]:
+    """Return the local maxima (n, 2) of (x, y), px, that stand out of the noise, and their heights, strongest first."""
+    height = relief.height
+    floor = max(_SIGNIFICANT * relief.noise, 1e-9 * float(np.ptp(height)))
+    peaks = local_maxima(height, max(TOLERANCE * spacing / relief.step, 1.5), floor)
+    x, y = peaks.astype(np.int64).T
+    inside = ndimage.binary_erosion(relief.valid)[y, x]  # a maximum on the rim is the flank of a column outside
+    strongest_first = np.argsort(-height[y, x], kind="stable")
+    strongest_first = strongest_first[inside[strongest_first]]
+    return relief.px(peaks[strongest_first]), height[y, x][strongest_first]
+
+
 def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_amplitude: float) -> Places:
     """Return the columns of the dominant sublattice and strong ones beside it, (n, 2) of (x, y), strongest first.
 
@@ -215,8 +227,8 @@ def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_ampl
        sit on the sites of most of the accepted ones within two steps, so that chains of noise lead nowhere. What is
        nearer than 0.7 spacings to a peak of its own sublattice is not accepted.
     4. Other sublattices are grown in the same way, and accepted if their start and their median reach 0.7 of the
-       first's: the second column of a dumbbell, a shifted terrace, another grain. Weaker ones, such as oxygen between
-       cerium, are left alone.
+       first's: the second column of a dumbbell, a shifted terrace, another grain. Fainter ones are looked for later
+       (:mod:`tract_dask.stages.columns.sublattices`).
     5. Off every lattice: a peak of half the median or more that is farther from all accepted ones than any place inside
        the lattice could be is accepted: an adatom, a step edge.
 
@@ -229,36 +241,29 @@ def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_ampl
     spacing
         In px, as the lattice.
     """
-    height = relief.height
-    floor = max(_SIGNIFICANT * relief.noise, 1e-9 * float(np.ptp(height)))
-    peaks = local_maxima(height, max(TOLERANCE * spacing / relief.step, 1.5), floor)
-    x, y = peaks.astype(np.int64).T
-    inside = ndimage.binary_erosion(relief.valid)[y, x]  # a maximum on the rim is the flank of a column outside
-    strongest_first = np.argsort(-height[y, x], kind="stable")
-    strongest_first = strongest_first[inside[strongest_first]]
-    peaks, weights = relief.px(peaks[strongest_first]), height[y, x][strongest_first]
+    peaks, weights = peaks_of(relief, spacing)
     if not len(peaks):
         return np.empty((0, 2))
     taken = np.zeros(len(peaks), dtype=bool)
     if lattice is None:
         return np.asarray(peaks[_spread(peaks, taken, weights >= _STRONG * np.quantile(weights, 0.95), 0.75 * spacing)])
-    start, support = _start(peaks, weights, lattice)
+    start, support = start_of(peaks, weights, lattice)
     median = support or float(weights[start])
     for _ in range(2):  # the median is that of the columns, which the first pass finds
-        taken = _grow(peaks, weights, lattice, start, min_amplitude * median, _STRONG * median)
+        taken = grown(peaks, weights, lattice, start, min_amplitude * median, _STRONG * median)
         median = float(np.median(weights[taken]))
     weakest, strong = min_amplitude * median, _STRONG * median
     while True:
         left = np.where(taken, 0.0, weights)
-        start, support = _start(peaks, left, lattice)
-        group = _grow(peaks, left, lattice, start, weakest, strong)
+        start, support = start_of(peaks, left, lattice)
+        group = grown(peaks, left, lattice, start, weakest, strong)
         if min(support, np.median(left[group])) < _ALIKE * median:
             break
         taken |= group
     return np.asarray(peaks[_spread(peaks, taken, weights >= strong, 1.1 * lattice.hole)])
 
 
-def _start(peaks: Places, weights: Reals, lattice: Lattice) -> tuple[int, float]:
+def start_of(peaks: Places, weights: Reals, lattice: Lattice) -> tuple[int, float]:
     """Return the peak of step 2 of :func:`find_peaks` (of few columns, one of the highest pair), and its measure."""
     sites = peaks[:, None] + lattice.translations(1)
     distance, neighbour = cKDTree(peaks).query(sites, distance_upper_bound=TOLERANCE * lattice.spacing)
@@ -269,7 +274,7 @@ def _start(peaks: Places, weights: Reals, lattice: Lattice) -> tuple[int, float]
     return start, float(support[start])
 
 
-def _grow(peaks: Places, weights: Reals, lattice: Lattice, start: int, weakest: float, strong: float) -> Mask:
+def grown(peaks: Places, weights: Reals, lattice: Lattice, start: int, weakest: float, strong: float) -> Mask:
     """Return which of the peaks, strongest first, belong to the sublattice of one: step 3 of :func:`find_peaks`."""
     tree = cKDTree(peaks)
     taken = np.zeros(len(peaks), dtype=bool)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,9 @@ from ..keep import content, save
 
 Draw = Callable[[xr.Dataset, xr.Dataset, Path], object]
 """Draws summed image and columns into a file, at once or in the background."""
+
+_KINDS = 6
+"""Kinds that a summary counts."""
 
 _OUR_TABLE = b"column_id,x,y,kind,"
 """How a table begins that a run has written."""
@@ -239,8 +243,10 @@ def _digest(data: bytes) -> str:
 def _columns_summary(columns: xr.Dataset) -> str:
     outside = int(((columns["status_ref"].to_numpy() & Status.OUTSIDE_FRAME) > 0).sum())
     merged = len(columns.attrs.get("merged", ()))
+    kinds = Counter(kind for kind in columns["kind"].to_numpy().astype(str).tolist() if kind)
+    of_kinds = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
     parts = (
-        f"{columns.sizes['column_id']} columns",
+        f"{columns.sizes['column_id']} columns" + f" ({of_kinds})" * (0 < len(kinds) <= _KINDS),
         f"{columns.attrs['contrast']}, as the image says" if "contrast_rival" in columns.attrs else "",
         f"{outside} outside the frame" if outside else "",
         f"{merged} seeds merged" if merged else "",
