@@ -377,7 +377,8 @@ def test_the_error_of_a_shape_that_all_frames_share_stays_in_the_mean():
     tracks = given_tracks(np.full(200, 3), 0.05, n_frames=50)
     table = given_table()
     free = count_atoms(tracks, table, 5.0, frames="mean", table_error=0)
-    held = count_atoms(tracks.assign_attrs(shape="fixed"), table, 5.0, frames="mean", table_error=0)
+    shared = tracks.assign(shape_error=("column_id", np.full(200, 0.5))).assign_attrs(shape="fixed")
+    held = count_atoms(shared, table, 5.0, frames="mean", table_error=0)
     assert (held["probability"].max("n_atoms") < free["probability"].max("n_atoms")).all()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import dask.array as da
 import numpy as np
@@ -83,25 +84,31 @@ def repeated_error(tracks: xr.Dataset) -> xr.Dataset:
     Dataset
         Over column_id, in the intensities' unit and as lazy as the tracks: ``mean``; ``sd``, the standard deviation
         over the frames, and ``sd_stderr``, its own standard error, sd / sqrt(2 (n - 1)); ``predicted``, Equation 5, and
-        ``fitted``, the standard error that the fits state, both root mean squares over the frames; ``n`` frames.
+        ``fitted``, the standard error that the fits state, both root mean squares over the frames; ``mean_stderr``, the
+        standard error of the mean; ``n`` frames.
 
     Notes
     -----
     ``sd`` also holds what the column's intensity really does. Equation 5 takes two independent counts, of column with
     background and of background alone, inside the ellipse; ``fitted`` is that of the fit that was made, and is what
-    ``sd`` should be for a column that does not change.
+    ``sd`` should be for a column that does not change. Frames do not lessen the error of the shape that all of them
+    have from the summed image: ``mean_stderr`` is sqrt(sd^2 / n + (shape_error fitted)^2), for comparisons between
+    columns.
     """
     tracks = accepted(tracks) if "status" in tracks else tracks
     intensity = tracks["intensity"]
     unit = str(intensity.attrs.get("units", "counts"))
     n = intensity.notnull().sum("frame")
     sd = standard_deviation(intensity)
+    fitted = _root_mean_square(tracks["intensity_stderr"])
+    of_mean = (sd**2 / n.where(n > 0) + (_shape_error(tracks) * fitted) ** 2) ** 0.5
     found = {
         "mean": (intensity.mean("frame"), "Mean intensity"),
         "sd": (sd, "Standard deviation of the intensity over the frames"),
         "sd_stderr": (sd / np.sqrt(2 * (n - 1).clip(min=1)), "Standard error of that standard deviation"),
         "predicted": (_root_mean_square(tracks["intensity_error"]), "Error by Equation 5"),
-        "fitted": (_root_mean_square(tracks["intensity_stderr"]), "Standard error that the fits state"),
+        "fitted": (fitted, "Standard error that the fits state"),
+        "mean_stderr": (of_mean, "Standard error of the mean intensity, that of the column's shape included"),
     }
     errors = xr.Dataset({name: named(values, unit, text) for name, (values, text) in found.items()})
     errors["n"] = named(n, "1", "Accepted frames")
@@ -191,6 +198,7 @@ def normalised(tracks: xr.Dataset, vacuum: xr.Dataset | xr.DataArray | float) ->
     Dataset
         (frame, column_id) ``intensity``, ``intensity_error`` (Equation 5) and ``intensity_stderr`` (from the fit), to
         both of which the error of the vacuum, which all columns share, is added in quadrature; as lazy as the tracks.
+        ``shape_error`` (column_id) as the tracks have it.
 
     Raises
     ------
@@ -212,7 +220,8 @@ def normalised(tracks: xr.Dataset, vacuum: xr.Dataset | xr.DataArray | float) ->
         name: named(value.transpose("frame", "column_id"), UNIT, schema.RESULTS[name].description)
         for name, value in values.items()
     }
-    return xr.Dataset(found, attrs=tracks.attrs)
+    beside = schema.SHAPE_ERROR.name
+    return xr.Dataset(found | ({beside: tracks[beside]} if beside in tracks else {}), attrs=tracks.attrs)
 
 
 def mean_intensity(tracks: xr.Dataset, frames: int | None = None) -> xr.Dataset:
@@ -228,9 +237,11 @@ def mean_intensity(tracks: xr.Dataset, frames: int | None = None) -> xr.Dataset:
     Returns
     -------
     Dataset
-        (frame, column_id) ``intensity`` and its standard error ``stderr``, from what the fits state; ``chi_squared``,
-        the mean square of the deviations from the mean in units of those errors, times n / (n - 1): 1 for a column that
-        does not change; ``n`` frames that count. ``frame`` is the first of each mean. As lazy as the tracks.
+        (frame, column_id) ``intensity`` and its standard error ``stderr``, from what the fits state, for the course of
+        one column; ``shape_stderr``, the error that all means of a column share, from its shape in the summed image;
+        ``chi_squared``, the mean square of the deviations from the mean in units of the frames' errors, times
+        n / (n - 1): 1 for a column that does not change; ``n`` frames that count. ``frame`` is the first of each mean.
+        As lazy as the tracks.
 
     Raises
     ------
@@ -240,7 +251,8 @@ def mean_intensity(tracks: xr.Dataset, frames: int | None = None) -> xr.Dataset:
     Notes
     -----
     All frames weigh alike. Weights from the frames' own errors would favour those that noise has made brighter or
-    darker, for the errors follow the intensity.
+    darker, for the errors follow the intensity. Columns are compared with each other, or with a table, by
+    sqrt(stderr^2 + shape_stderr^2).
     """
     tracks = accepted(tracks) if "status" in tracks else tracks
     n_frames = tracks.sizes["frame"]
@@ -261,6 +273,9 @@ def mean_intensity(tracks: xr.Dataset, frames: int | None = None) -> xr.Dataset:
         {
             "intensity": named(mean, unit, "Mean intensity"),
             "stderr": named((variance / n.where(n > 0)) ** 0.5, unit, "Standard error of the mean"),
+            "shape_stderr": named(
+                _shape_error(tracks) * variance**0.5, unit, "Error that all means of a column share, from its shape"
+            ),
             "chi_squared": named(scatter, "1", "Scatter against the errors: 1 for a column that does not change"),
             "n": named(n, "1", "Accepted frames"),
         }
@@ -291,9 +306,9 @@ def intensity_against_dose(
     Returns
     -------
     Dataset
-        (dose, column_id), ascending: ``intensity``, the mean over the frames, with ``stderr``; ``error_68`` and
-        ``error_95``, of a single frame by Equation 5 (the paper's error bars); ``sd``, by repetition, with
-        ``sd_stderr``; ``fitted``, that of the fit; ``n`` frames. In memory.
+        (dose, column_id), ascending: ``intensity``, the mean over the frames, with ``stderr``, that of its shape, which
+        doses have in common, included; ``error_68`` and ``error_95``, of a single frame by Equation 5 (the paper's
+        error bars); ``sd``, by repetition, with ``sd_stderr``; ``fitted``, that of the fit; ``n`` frames. In memory.
 
     Raises
     ------
@@ -314,13 +329,18 @@ def intensity_against_dose(
         known = accepted(one).sel(column_id=list(columns))
         found = repeated_error(known if unit is None else normalised(known, unit)).compute()
         counts = found["mean"].attrs["units"]
-        stderr = named(found["sd"] / np.sqrt(found["n"]), counts, "Standard error of the mean")
         error_95 = named(_NORMAL_95 * found["predicted"], counts, "Error by Equation 5, 95 %")
-        found = found.rename(mean="intensity", predicted="error_68").assign(stderr=stderr, error_95=error_95)
+        names = {"mean": "intensity", "mean_stderr": "stderr", "predicted": "error_68"}
+        found = found.rename(names).assign(error_95=error_95)
         rows.append(found)
     table: xr.Dataset = xr.concat(rows, dim="dose", join="exact").assign_coords(dose=doses).sortby("dose")
     table["dose"].attrs = {"units": "e/A^2", "long_name": "Dose of a frame"}
     return table
+
+
+def _shape_error(tracks: xr.Dataset) -> Any:
+    """Return the error that all frames of a column share, over that of one frame, (column_id); 0 where none is told."""
+    return tracks.get(schema.SHAPE_ERROR.name, 0.0)
 
 
 def _root_mean_square(values: xr.DataArray) -> xr.DataArray:

@@ -20,7 +20,7 @@ from ..kernels.gaussian.parameters import AMPLITUDE
 from ..kernels.windows import blur_variance
 from ..settings.run import FitSettings
 from ..store.results import accepted, fitted_with, weakest
-from ..store.schema import NOT_SEEN, Status
+from ..store.schema import NOT_SEEN, SHAPE_ERROR, Status
 from .intensity import UNIT, normalised
 from .likelihood import CONFIDENCE, Levels, credible_sets, probabilities
 from .lookup import intensity_bound, look_up_table, read_table, write_table
@@ -321,14 +321,14 @@ def _reference(tracks: xr.Dataset, noise_scale: float) -> xr.Dataset:
     fits = np.where(np.isnan(fits), np.nanmedian(fits, axis=0), fits)
     sharp = blurred(fits, -blur_variance(fitted_with(tracks, "reference_blur_px")))
     window_px, held = fitted_with(tracks, "window_px"), fitted_with(tracks, "shape") == "fixed"
-    fixed, free = (intensity_bound(sharp, window_px, fixed_shape=fixed_shape) for fixed_shape in (True, False))
+    bound = intensity_bound(sharp, window_px, fixed_shape=held)
     as_fitted = blurred(sharp, blur_variance(fitted_with(tracks, "window_blur_px")))
     intensity = np.abs(intensities(as_fitted, fitted_with(tracks, "intensity_scale"))[0])
-    common = np.sqrt(np.maximum(free**2 - fixed**2, 0) / tracks.sizes["frame"])
+    shared = tracks[SHAPE_ERROR.name].to_numpy() if SHAPE_ERROR.name in tracks else np.zeros(len(fits))
     values = {
         "area": intensity / np.abs(as_fitted[:, AMPLITUDE]),
-        "sigma": noise_scale * (fixed if held else free) * intensity,
-        "shape_error": noise_scale * np.nan_to_num(common) * held,
+        "sigma": noise_scale * bound * intensity,
+        "shape_error": noise_scale * np.nan_to_num(shared * bound),
     }
     columns = {"column_id": tracks["column_id"]}
     return xr.Dataset({name: ("column_id", array) for name, array in values.items()}, columns)

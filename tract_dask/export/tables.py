@@ -107,7 +107,8 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
     DataFrame
         ``frame``, ``time``, ``column_id``, ``kind``, ``x_pm`` and ``y_pm`` (where the size of a pixel is known), then
         the variables of the results under their names: the parameters of the fit, ``x_stderr`` for the standard error
-        of x, ``drift_y`` for the y axis of drift; ``accepted`` tells which fits are. Units are those of the results.
+        of x, ``drift_y`` for the y axis of drift; ``shape_error`` of the column; ``accepted`` tells which fits are.
+        Units are those of the results.
         What is measured in vacuum, and motions that are not undone, are left out.
     """
     tracks = tracks.compute()
@@ -125,6 +126,8 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
     for name in [*said, *map(str, tracks.data_vars)]:
         if name not in columns and name not in _LEFT_OUT and "frame" in tracks[name].dims:
             columns |= _flat(name, tracks[name], n_columns)
+    if (shared := schema.SHAPE_ERROR.name) in tracks:
+        columns[shared] = np.tile(tracks[shared].to_numpy(), n_frames)
     columns["accepted"] = is_accepted(tracks["status"]).to_numpy().ravel()
     return pd.DataFrame(columns)
 

@@ -82,6 +82,14 @@ def blur_variance(sigma: float) -> float:
     return float(kernel @ (np.arange(kernel.size) - kernel.size // 2) ** 2.0)
 
 
+def spreading(size: int, kernel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the matrix (size + kernel - 1, size) that blurs what stands in a row, and loses nothing at its ends."""
+    spread = np.zeros((size + kernel.size - 1, size))
+    for k, weight in enumerate(kernel):
+        spread[np.arange(size) + k, np.arange(size)] = weight
+    return spread
+
+
 def blur(image: Array, sigma: float) -> npt.NDArray[np.float32]:
     """Return the image blurred with a circular Gaussian, as ``scipy.ndimage.gaussian_filter(mode="nearest")`` does.
 

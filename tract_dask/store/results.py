@@ -257,8 +257,8 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
         )
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
-    grouped = [schema.GROUP.name] if schema.GROUP.name in stored else []  # earlier versions have none
-    dataset = stored[[*schema.RESULTS, *schema.COLUMNS, *grouped]].chunk(frame=frames)
+    beside = [of.name for of in (schema.GROUP, schema.SHAPE_ERROR) if of.name in stored]  # earlier versions have none
+    dataset = stored[[*schema.RESULTS, *schema.COLUMNS, *beside]].chunk(frame=frames)
     if not about.get("complete"):
         dataset = _grown(dataset, path)
     dataset.attrs |= {name: about.get(name) for name in _SCALES}

@@ -196,6 +196,16 @@ COLUMNS = _declare(
 GROUP = Variable("group", ("column_id",), "int64", "1", "Touching columns that are fitted together; 0: alone", 0)
 """A variable that columns may have; without it all are alone."""
 
+SHAPE_ERROR = Variable(
+    "shape_error",
+    ("column_id",),
+    "float64",
+    "1",
+    "Error of the intensity that all frames share, from the column's shape in the summed image, over intensity_stderr",
+    _NAN,
+)
+"""A variable that tracks have beside :data:`RESULTS`; 0 where shapes are free."""
+
 DRIFT = _declare(
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
     Variable(

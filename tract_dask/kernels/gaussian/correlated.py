@@ -60,17 +60,23 @@ def shared_noise(
     correlation
         (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; 1 in the middle.
     """
-    shape = np.abs(parameters[:, [SIGMA_A, SIGMA_B, AMPLITUDE, BACKGROUND]])
-    shape[:, 2] /= np.maximum(shape[:, 3], 1e-9 * np.maximum(shape[:, 2], 1e-300))
-    alike = np.rint(np.log(np.maximum(shape[:, :3], 1e-6)) / _ALIKE)
-    _, first, which = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+    first, which = alike(parameters)
     kernel = gaussian_kernel(blur_sigma_px).astype(np.float64)
     found = [
         _factors(parameters[k], size, correlation, kernel, (fixed_shape, counting or likelihood, likelihood))
         for k in first
     ]
-    factors = np.array(found).reshape(-1, 9)[which.ravel()]
+    factors = np.array(found).reshape(-1, 9)[which]
     return SharedNoise(factors[:, :8], factors[:, 8])
+
+
+def alike(parameters: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return one column (n, 7) of each shape and contrast, and for each column which of them is like it, (n,)."""
+    shape = np.abs(parameters[:, [SIGMA_A, SIGMA_B, AMPLITUDE, BACKGROUND]])
+    shape[:, 2] /= np.maximum(shape[:, 3], 1e-9 * np.maximum(shape[:, 2], 1e-300))
+    classes = np.rint(np.log(np.maximum(shape[:, :3], 1e-6)) / _ALIKE)
+    _, first, which = np.unique(classes, axis=0, return_index=True, return_inverse=True)
+    return first, which.ravel()
 
 
 def noise_spectrum(correlation: Floats, shape: tuple[int, ...]) -> Floats:

@@ -12,7 +12,7 @@ from ...kernels.gaussian.information import model_slopes
 from ...kernels.gaussian.joint import fit_joint
 from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
-from ...kernels.windows import blur_variance, gaussian_kernel
+from ...kernels.windows import blur_variance, gaussian_kernel, spreading
 from ...settings.run import FitSettings
 from ..groups import touching
 from .goodness import Freedom, freedom_left
@@ -166,7 +166,7 @@ def _filters(own: Floats, masks: NDArray[np.bool_], blur_sigma_px: float) -> NDA
     n, members, _ = own.shape
     down, across = (np.arange(side) for side in masks.shape[1:])
     kernel = gaussian_kernel(blur_sigma_px).astype(np.float64)
-    by_rows, by_columns = (_spread(side, kernel) for side in masks.shape[1:])
+    by_rows, by_columns = (spreading(side, kernel) for side in masks.shape[1:])
     filters = np.zeros((n, members, *masks.shape[1:]), np.float32)
     for k in range(n):
         shapes, narrow = own[k].copy(), blurred(own[k], -2 * blur_variance(blur_sigma_px))
@@ -247,7 +247,7 @@ def _exact(
     raw = evaluate(narrow, across, down[:, None]).sum(axis=0) + background
     counted = settings.counting and (raw > 0).any()
     variance = np.maximum(raw, _LEAST * raw.max()) if counted else np.ones_like(raw)
-    power, spread = ([_spread(side, weights) for side in mask.shape] for weights in (kernel**2, kernel))
+    power, spread = ([spreading(side, weights) for side in mask.shape] for weights in (kernel**2, kernel))
     whole = float((power[0] @ mask.astype(float) @ power[1].T * variance).sum())
     wide = spread[0] @ images @ spread[1].T * np.sqrt(variance)
     shared = wide if correlation is None else _shared(wide, correlation)
@@ -276,11 +276,3 @@ def _share(kernel: Floats, correlation: Floats) -> float:
     lags = np.pad(lags, max(0, reach - kernel.size + 1))
     kept = lags[len(lags) // 2 - reach : len(lags) // 2 + reach + 1]
     return float((correlation * np.outer(kept, kept)).sum()) / float(lags[len(lags) // 2]) ** 2
-
-
-def _spread(size: int, kernel: Floats) -> Floats:
-    """Return the matrix (size + kernel - 1, size) that blurs what stands in a row, and loses nothing at its ends."""
-    spread = np.zeros((size + kernel.size - 1, size))
-    for k, weight in enumerate(kernel):
-        spread[np.arange(size) + k, np.arange(size)] = weight
-    return spread

@@ -35,6 +35,7 @@ from .goodness import Freedom
 from .groups import Groups, plan_groups
 from .noise_size import WindowNoise, window_noise
 from .same_atom import Pairs
+from .shape_error import shape_errors
 from .vacuum import check_box, find_vacuum, why_unusable
 
 
@@ -79,12 +80,14 @@ class Job:
     """What summing by whole pixels adds to the variance of a column, px^2."""
     full_scale: float | None = None
     """Counts at which pixels are cut off; None where they are not."""
+    summed: Floats | None = None
+    """(columns,) frames that show the column in the summed image; None where it is not known."""
 
     def save(self, path: Path, movie: Movie, key: str) -> None:
         """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
         results.create(
             path,
-            self.columns,
+            self.columns.assign({schema.SHAPE_ERROR.name: self.shape_error}),
             self.drift,
             movie.times(),
             movie.shards[0].frames,
@@ -259,6 +262,17 @@ class Job:
         return plan_groups(self.group_numbers, self.reference, self.window_px, self.settings, shared)
 
     @cached_property
+    def shape_error(self) -> xr.Variable:
+        """Error of the intensity that all frames share, over a frame's own, (columns,); :data:`schema.SHAPE_ERROR`."""
+        shared = None if self.correlation is None else np.array(self.correlation)
+        of_one = shape_errors(
+            self.reference, self.window_px, self.groups, self.settings, self.reference_blur_px, shared
+        )
+        frames = np.full(len(of_one), np.nan) if self.summed is None else self.summed
+        kind = schema.SHAPE_ERROR
+        return xr.Variable(kind.dims, of_one / np.sqrt(np.maximum(frames, 1)), kind.attributes)
+
+    @cached_property
     def in_units(self) -> Job:
         """The same with the reference's counts in the unit that frames are computed in."""
         return replace(self, unit=unit_of(self.reference[:, [AMPLITUDE, BACKGROUND]]))
@@ -275,9 +289,6 @@ def prepare(
     """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
     schema.validate(columns, schema.COLUMNS, "columns")
     shift = schema.drift_of(drift, movie.n_frames)
-    given = settings.window_px or columns.attrs.get("window_px")
-    spacing = None if given else neighbour_distance(positions(columns))
-    window_px = resolve_window(given, movie.shape[1:], spacing)
     blur = resolve_blur(settings.blur_sigma_px, columns)
     settings = replace(settings, blur_sigma_px=blur)
     _check_drift_columns(settings, columns)
@@ -297,7 +308,7 @@ def prepare(
         columns,
         shift,
         bad,
-        window_px=window_px,
+        window_px=_window_px(movie, columns, settings),
         vacuum=None if unusable else box,
         unusable=unusable,
         reference_blur_px=columns.attrs.get("blur_sigma_px", blur),
@@ -309,7 +320,24 @@ def prepare(
         dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
         correlation=camera.correlation if camera.shared.size > 1 else None,
         full_scale=_full_scale(movie),
+        summed=_summed_frames(movie, columns, summed, int(np.count_nonzero(~bad)) - len(_lost(drift))),
     )
+
+
+def _window_px(movie: Movie, columns: xr.Dataset, settings: FitSettings) -> int:
+    given = settings.window_px or columns.attrs.get("window_px")
+    spacing = None if given else neighbour_distance(positions(columns))
+    return resolve_window(given, movie.shape[1:], spacing)
+
+
+def _summed_frames(movie: Movie, columns: xr.Dataset, summed: xr.Dataset | None, usable: int) -> Floats:
+    """Return how many frames of the movie show each column in the summed image, (columns,)."""
+    if summed is None:
+        return np.full(columns.sizes["column_id"], float(usable))
+    exposure = summed["exposure"].to_numpy()
+    y, x = np.rint(positions(columns)[:, ::-1]).astype(np.int64).T
+    inside = np.clip(y, 0, exposure.shape[0] - 1), np.clip(x, 0, exposure.shape[1] - 1)
+    return np.asarray(exposure[inside] * (Camera.of(summed.attrs).frames / movie.summed))
 
 
 def _check_drift_columns(settings: FitSettings, columns: xr.Dataset) -> None:

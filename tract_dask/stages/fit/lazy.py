@@ -70,6 +70,7 @@ def fit_columns(
         blocks = [da.from_delayed(fits[name], shape, of.dtype) for fits, shape in zip(shards, shapes, strict=True)]
         dataset[name] = (of.dims, da.concatenate(blocks), of.attributes)
     dataset["drift_measured"] = (("frame", "axis"), job.drift, schema.RESULTS["drift_measured"].attributes)
+    dataset[schema.SHAPE_ERROR.name] = job.shape_error
     dataset["time"] = ("frame", movie.times(), schema.RESULTS["time"].attributes)
     dataset.attrs = calibration(movie) | results.how_fitted(
         job.settings, job.window_px, job.reference_blur_px, job.scale, job.dark_variance

@@ -21,7 +21,7 @@ from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.information import model_slopes
 from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
-from ...kernels.windows import blur_variance, gaussian_kernel
+from ...kernels.windows import blur_variance, gaussian_kernel, spreading
 from ...settings.run import FitSettings
 from .goodness import Freedom, freedom
 
@@ -174,21 +174,13 @@ def _disc(size: int) -> NDArray[np.bool_]:
     return np.hypot(offset[:, None], offset) <= size / 2
 
 
-def _spread(size: int, kernel: Floats) -> Floats:
-    """Return the matrix (size + kernel - 1, size) that blurs what stands in a row, and loses nothing at its ends."""
-    spread = np.zeros((size + kernel.size - 1, size))
-    for k, weight in enumerate(kernel):
-        spread[np.arange(size) + k, np.arange(size)] = weight
-    return spread
-
-
 def _exact(column: Floats, size: int, settings: FitSettings) -> tuple[Floats, float, float]:
     """Return standard errors (7,) and that of the volume for noise of size 1, and the share of it that a fit leaves."""
     fixed, disc = settings.shape == "fixed", _disc(size)
     _, slopes, by_volume = model_slopes(column, *_places(size), fixed_shape=fixed)
     scale = np.sqrt((slopes**2).sum(axis=1))
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
-    spread, power = _spread(size, kernel), _spread(size, kernel**2)
+    spread, power = spreading(size, kernel), spreading(size, kernel**2)
     images = np.zeros((len(slopes), size, size))
     images[:, disc] = slopes / scale[:, None]
     inverse = np.linalg.inv(images[:, disc] @ images[:, disc].T)
