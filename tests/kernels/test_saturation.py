@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tract_dask.kernels.defects import Moments, look_back
 from tract_dask.kernels.saturation import full_scale
 
 SHAPE = (90, 96)
@@ -59,3 +60,27 @@ def test_a_level_into_which_dark_columns_fade_is_not_full_scale():
 def test_a_flat_image_with_hardly_any_noise_is_cut_off():
     flat = np.random.default_rng(0).normal(254.5, 0.7, (9, *SHAPE))
     assert found(np.minimum(np.rint(flat), 255)) == 255
+
+
+def cut_off_after(frames):
+    """How many pixels are cut off where a gain reference has corrected the frames."""
+    gain = np.random.default_rng(2).normal(1, 0.05, SHAPE).astype(np.float32)
+    moments = Moments(SHAPE)
+    for number, frame in enumerate(frames):
+        moments.add((frame * gain).astype(np.float32), follows=number > 0)
+    history = look_back(moments)
+    assert history.full_scale is None
+    return history.cut_off
+
+
+@pytest.mark.parametrize(("level", "top"), [((60, 20), 60), ((900, 300), 1000), ((5e4, 1e4), 4e4)])
+def test_pixels_that_were_cut_off_before_a_gain_correction_are_seen(level, top):
+    """Most of those that are cut off in the mean; none that stay below by five standard deviations."""
+    found, mean = cut_off_after(np.minimum(counts(*level, 24), top)), levels(*level)
+    assert 0.5 * (mean > top).sum() < found < 1.5 * (mean > top - 2 * np.sqrt(top)).sum()
+
+
+@pytest.mark.parametrize("n_frames", [8, 32])
+@pytest.mark.parametrize("level", [(60, 20), (-18, 20), (900, 300), (2, 1), (0.3, 0.1), (0.1, 0.03)])
+def test_nothing_is_cut_off_in_counts_that_a_gain_reference_corrected(level, n_frames):
+    assert cut_off_after(counts(*level, n_frames)) == 0

@@ -6,12 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from tract_dask import sum_image
 from tract_dask.errors import InputError
 from tract_dask.kernels.noise import Cells, fit_law
-from tract_dask.report.camera import camera_findings, pattern_words
+from tract_dask.report.camera import camera_findings, fine_columns, pattern_words
 from tract_dask.stages.noise import _pattern, measure_camera
 from tract_dask.stages.sum import _measured
 from tract_dask.store.camera import NOT_MEASURED, Camera
@@ -252,3 +253,30 @@ def test_a_fixed_pattern_is_told(size):
     assert camera.fixed_pattern == pytest.approx(size, rel=0.1)
     assert (pattern_words(camera) is not None) == (size > 0)
     assert Camera.of(camera.to_attribute()) == camera
+
+
+def test_still_columns_as_fine_as_a_pattern_are_no_warning():
+    """The fits on the summed image tell how much of a pattern they look like."""
+    side, level = 96, 100.0
+    fit = np.array([[level, x, y, 0.7, 0.7, 0.0, level] for x, y in _fine_places(side)])
+    tracks = xr.Dataset({"fit_ref": (("column_id", "parameter"), fit)}, attrs={"reference_blur_px": 0.0})
+    still = np.zeros((24, 2))
+    pixels = np.repeat(level * _fine_columns(side)[None], 24, axis=0)
+    seen = _pattern(Recorded(pixels=pixels), still[:, 0] == 0, 0.0)
+    camera = Camera(pattern=seen.value, pattern_stderr=seen.stderr)
+    assert pattern_words(camera)
+    assert pattern_words(camera, fine_columns(tracks, still, (side, side))) is None
+    assert fine_columns(tracks, np.arange(48.0).reshape(24, 2), (side, side)) == 0
+    wide = tracks.assign(fit_ref=tracks["fit_ref"] * [1, 1, 1, 3, 3, 1, 1])
+    assert fine_columns(wide, still, (side, side)) == 0
+
+
+def _fine_places(side):
+    return 6.3 * np.stack(np.meshgrid(*[np.arange(side // 6.3)] * 2), axis=-1).reshape(-1, 2) + 2.2
+
+
+def _fine_columns(side):
+    """Columns with a sigma of 0.7 px, as high as the background, (y, x)."""
+    axis = np.arange(side)
+    y, x = (np.exp(-((axis - at[:, None]) ** 2) / 2 / 0.7**2) for at in _fine_places(side)[:, ::-1].T)
+    return 1 + np.einsum("cy,cx->yx", y, x)

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .saturation import full_scale
+from .saturation import cut_off_one_by_one, full_scale
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.uint8]
@@ -40,6 +40,8 @@ _LIKELY = 25.0
 _LINE_SHARE = 0.95
 _EDGE_NOISE = 10.0
 _BINS = 16
+_ENOUGH = 1 << 20
+"""Of so many pixels it is looked whether they are cut off one by one."""
 
 
 class Moments:
@@ -117,6 +119,8 @@ class History(NamedTuple):
         Value at which pixels are cut off; None where they are not.
     relief
         How many standard deviations are taken off h - l in single frames.
+    cut_off
+        How many pixels are cut off, each at a value of its own, as in frames that a gain reference has corrected.
     """
 
     mask: Mask
@@ -124,6 +128,7 @@ class History(NamedTuple):
     noise: Noise
     full_scale: float | None = None
     relief: float = _RELIEF
+    cut_off: int = 0
 
 
 def look_back(moments: Moments) -> History | None:
@@ -141,7 +146,19 @@ def look_back(moments: Moments) -> History | None:
     top = full_scale(moments.second, moments.last, (mask == 0) & ~odd)
     stuck = _stuck(moments.changes, moments.pairs, (mask > 0) | (moments.second == (np.nan if top is None else top)))
     mask[(mask == 0) & ((low > 0) | (stuck > 0)) & ~odd] = DEAD
-    return History(mask, _usual(np.where(mask > 0, np.float32(np.nan), mean), noise), noise, top)
+    usual = _usual(np.where(mask > 0, np.float32(np.nan), mean), noise)
+    return History(mask, usual, noise, top, cut_off=_cut_off(moments, (mask == 0) & ~odd, noise) if top is None else 0)
+
+
+def _cut_off(moments: Moments, used: NDArray[np.bool_], noise: Noise) -> int:
+    """Return how many pixels are cut off at values of their own."""
+    chosen = np.flatnonzero(used)[:: max(1, used.size // _ENOUGH)]
+    first, second, level, variance = (
+        values.ravel()[chosen] for values in (moments.first, moments.second, moments.mean, moments.variance)
+    )
+    expected = np.maximum(noise.even + noise.slope * np.maximum(level, 0), np.finfo(np.float32).tiny)
+    share = int(used.sum()) / max(1, len(chosen))
+    return round(share * cut_off_one_by_one(first, second, level, (variance / expected).astype(np.float32)))
 
 
 def look_at_few(frames: Sequence[NDArray[Any]]) -> History | None:

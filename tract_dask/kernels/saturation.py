@@ -3,14 +3,20 @@
 Values become rarer towards the largest one, the more the farther: with n pixels of the largest value and m of the next
 one below, about n^2 / m would be higher still. Where that is many, and there are none, something has cut them off.
 Not so where values fade into the largest one, as dark columns without noise do into the vacuum around them.
+
+Where frames were corrected by a gain reference afterwards, each pixel is cut off at a value of its own. It has that
+value again and again, and varies by less than pixels of its level do.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
 
 _MISSING = 30.0
 """So many pixels would be higher by chance."""
@@ -23,6 +29,43 @@ _EXACT = 2.0**24
 _FADES, _LITTLE, _ALONE = 0.5, 1e-3, 0.02
 """It fades where this share of the pixels beside it have the next value, or this little of the range less, and hardly
 any pixel stands alone, as many do in noise."""
+
+
+_LEVELS = (0.0, 0.5, 0.7, 0.9, 0.97, 0.99, 0.997, 1.0)
+"""Groups of pixels by their level, as shares of all."""
+_FEWEST_CUT, _TIED, _SURE, _QUIET = 32, 0.5, 5.0, 0.7
+"""A group of so many pixels is cut off where more than this share has its highest value twice, by so many standard
+errors more than in the darker group with the fewest, and where it has less than this share of the usual variance."""
+_NEAR = 2.0
+"""Its highest values are less than so many times its mean: one electron in a frame, or none, is no cut."""
+
+
+def cut_off_one_by_one(highest: Floats, second: Floats, level: Floats, quietness: Floats) -> int:
+    """Return how many pixels of a movie are cut off, each at its own value; 0 where that is not seen.
+
+    Parameters
+    ----------
+    highest, second
+        (pixels,) the two highest values of each pixel in a sample of frames.
+    level, quietness
+        (pixels,) its mean, and its variance over that of the noise at this level.
+    """
+    order = np.argsort(level, kind="stable")
+    tied = (highest == second)[order]
+    edges = np.rint(np.array(_LEVELS) * len(order)).astype(int)
+    least, found = 1.0, 0
+    for first, stop in pairwise(edges):
+        group, number, which = tied[first:stop], stop - first, order[first:stop]
+        if number < _FEWEST_CUT:
+            continue
+        share = float(group.mean())
+        sure = _SURE * np.sqrt(share * (1 - share) / number + 0.25 / number)
+        near = np.median(highest[which]) < _NEAR * np.median(level[which])
+        if near and share > max(_TIED, least + sure) and quietness[which].mean() < _QUIET:
+            found += int(group.sum())
+        else:
+            least = min(least, share)
+    return found
 
 
 def full_scale(usual_high: NDArray[np.float32], frame: NDArray[Any], used: NDArray[np.bool_]) -> float | None:

@@ -6,8 +6,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from ..kernels.gaussian.model import blurred
+from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from ..kernels.patterns import fine
+from ..kernels.rendering import add_columns
+from ..kernels.windows import blur_variance
 from ..store.camera import Camera
 
 OFF = 0.1
@@ -19,25 +25,52 @@ FAINT, FAINT_ERRORS = 0.03, 0.1
 is worth it where it is more than :data:`OFF_BY` stated errors of a column's mean; and by which errors of places are too
 small."""
 OFF_BY = 2.0
+_MOST = 0.5
+_SHARP_PX, _NARROWEST_PX, _DOUBT = 1.3, 0.3, 1.5
+"""Columns of less than this sigma are as fine as a pattern, and are drawn with no less than that; what they have of it
+is known to this factor."""
 _SURE = 5.0
 """Standard errors by which it must be off as well; columns that move by themselves leave more than one."""
 _READ_SHARE = 0.5
 """An offset that would leave more than this share of the noise to the read noise is doubted."""
 
 
-def pattern_words(camera: Camera) -> dict[str, Any] | None:
-    """Return what there is to say of a fixed pattern: title, text and remedy; None where there is none to speak of."""
-    if camera.fixed_pattern <= PATTERN:
+def pattern_words(camera: Camera, of_columns: float = 0.0) -> dict[str, Any] | None:
+    """Return what there is to say of a fixed pattern: title, text and remedy; None where there is none to speak of.
+
+    ``of_columns``: what columns as fine as a pattern have of its variance, see :func:`fine_columns`.
+    """
+    if camera.fixed_pattern <= PATTERN or (camera.pattern or 0.0) - _DOUBT * of_columns <= PATTERN**2:
         return None
     text = (
         f"The pixels differ in sensitivity by {camera.fixed_pattern:.1%} (standard deviation). Columns move over this "
         "pattern, and their places and intensities scatter by more than the errors say."
     )
-    remedy = (
-        "Run again with --gain-reference (and --dark) of this camera; with columns narrower than 1.3 px, look first "
-        "whether the mean image shows a pattern."
-    )
+    remedy = "Run again with --gain-reference (and --dark) of this camera."
     return {"title": "The detector has a fixed pattern", "text": text, "remedy": remedy}
+
+
+def fine_columns(tracks: xr.Dataset, drift: NDArray[np.float64], shape: tuple[int, ...]) -> float:
+    """Return the variance, as a share of the level squared, that columns have where a fixed pattern is looked for.
+
+    It is 0 for columns of more than 1.3 px, which have next to none, and where most frames lie apart by their ``drift``
+    (frame, axis): a shift by one pixel turns the sign of what is so fine. ``shape`` is that of the summed image (y, x).
+    """
+    fit = tracks["fit_ref"].to_numpy().astype(np.float64)
+    own = blurred(fit[np.isfinite(fit).all(axis=1)], -blur_variance(float(tracks.attrs["reference_blur_px"])))
+    sigma = np.sqrt(np.maximum(own[:, SIGMA_A] * own[:, SIGMA_B], _NARROWEST_PX**2))
+    if not len(own) or np.median(sigma) > _SHARP_PX or _share_alike(drift) < _MOST:
+        return 0.0
+    image = np.full(shape, np.median(own[:, BACKGROUND]))
+    add_columns(image, own[:, X], own[:, Y], own[:, AMPLITUDE], sigma)
+    level = float(np.square(image).mean())
+    return float(np.square(fine(image)).mean()) / level if level > 0 else 0.0
+
+
+def _share_alike(drift: NDArray[np.float64]) -> float:
+    """Return the share of pairs of frames that lie alike, to a pixel."""
+    count = np.unique(np.rint(drift), axis=0, return_counts=True)[1]
+    return float((count**2).sum()) / max(1, len(drift)) ** 2
 
 
 def faint_words(faint: NDArray[np.float64], accepted: NDArray[np.int64]) -> dict[str, Any] | None:

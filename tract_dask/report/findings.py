@@ -14,7 +14,7 @@ from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
-from .camera import camera_findings, faint_words, pattern_words
+from .camera import camera_findings, faint_words, fine_columns, pattern_words
 from .crystal import left_out_words, motion_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
@@ -108,7 +108,9 @@ def _camera(run: Survey) -> Iterator[Finding]:
     image = run.summed["image"].to_numpy()[run.summed["exposure"].to_numpy() > 0]
     level = float(np.median(image)) / said["gain"] + said["offset"] if image.size else 0.0
     camera = Camera.of(run.summed.attrs)
-    if words := pattern_words(camera):
+    drift = run.frames["drift_measured"].to_numpy()
+    of_columns = fine_columns(run.tracks, drift, run.summed["image"].shape) if camera.fixed_pattern else 0.0
+    if words := pattern_words(camera, of_columns):
         yield Finding("gain_pattern", **words)
     for words in camera_findings(camera, said["gain"], said["offset"], level):
         yield Finding("camera", **words)
@@ -131,6 +133,14 @@ def _pixels(run: Survey) -> Iterator[Finding]:
             "the errors in these windows are wider."
         )
         remedy = "Record with less beam or shorter frames. Was the file stretched to 8 bits, convert the original."
+        yield Finding("saturated", "Pixels are saturated", text, remedy)
+    if cut_off := counts.get("cut off"):
+        text = (
+            f"{count(cut_off, 'pixel')} have the same highest value again and again, each its own: they were "
+            "saturated, and the frames were corrected afterwards. What was above is cut off: heights of these columns "
+            "are too small, their widths and intensities too large."
+        )
+        remedy = "Convert the frames as they were recorded, with --gain-reference; or record with less beam."
         yield Finding("saturated", "Pixels are saturated", text, remedy)
     if why := run.about.get("vacuum_unusable"):
         text = f"The vacuum is not used to measure the noise: {why}. The noise is that of the fits' residuals."

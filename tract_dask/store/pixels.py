@@ -4,8 +4,9 @@ Array ``0`` holds the frames as they were recorded. In the group ``pixels`` lie 
 of every frame; ``spikes`` (n, 3), frame, row and column of pixels that are left out of one frame; ``borders``
 (frames, 4), first and last row and column (not included) of what a frame shows; ``dark`` and ``gain`` (y, x), what is
 subtracted from a pixel, and what it is multiplied by then; ``full_scale`` (1,), the recorded value at which pixels are
-cut off, and ``saturated`` (frames,), how many are. Only what there is is stored. A movie is read corrected, with NaN at
-the pixels that carry no data, and infinity where they are saturated: what they hold is a lower bound.
+cut off, and ``saturated`` (frames,), how many are; ``cut_off`` (1,), how many have a top of their own. Only what there
+is is stored. A movie is read corrected, with NaN at the pixels that carry no data, and infinity where they are
+saturated: what they hold is a lower bound.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _DIMENSIONS = {
     "gain": ("y", "x"),
     "full_scale": ("level",),
     "saturated": ("t",),
+    "cut_off": ("level",),
 }
 
 
@@ -59,6 +61,8 @@ class Pixels:
         (1,) value at which pixels are cut off, detector units.
     saturated
         (frames,) how many pixels of a frame have it, beside those that are left out already.
+    cut_off
+        (1,) how many pixels are cut off, each at a value of its own, and not at a full scale.
     """
 
     mask: NDArray[np.uint8] | None = None
@@ -68,6 +72,7 @@ class Pixels:
     gain: NDArray[np.float32] | None = None
     full_scale: NDArray[np.float64] | None = None
     saturated: NDArray[np.uint32] | None = None
+    cut_off: NDArray[np.int64] | None = None
 
     def __bool__(self) -> bool:
         return any(getattr(self, field.name) is not None for field in fields(self))
@@ -85,6 +90,8 @@ class Pixels:
         if self.saturated is not None:
             found["saturated"] = int(self.saturated.sum(dtype=np.int64))
             found["frames with saturated pixels"] = int(np.count_nonzero(self.saturated))
+        if self.cut_off is not None:
+            found["cut off"] = int(self.cut_off[0])
         return found
 
     def applied(self, block: NDArray[Any], first: int, top: int = 0, left: int = 0) -> NDArray[Any]:

@@ -114,16 +114,16 @@ def _load(folder: Path) -> Finder:
     named, dark, gain = (
         values if values.size else None for values in (load_saved(folder / f"{name}.npy") for name in _REFERENCES)
     )
-    even, slope, full, relief = map(float, limits)
-    noise = Noise(even, slope)
-    history = History(mask, usual, noise, None if np.isnan(full) else full, relief) if mask.size else None
+    even, slope, full, relief, cut_off = map(float, limits)
+    scale = None if np.isnan(full) else full
+    history = History(mask, usual, Noise(even, slope), scale, relief, int(cut_off)) if mask.size else None
     return Finder(history, Pixels(mask=named, dark=dark, gain=gain), bool(searches))
 
 
 def _save_limits(path: Path, history: History | None) -> None:
     full = history.full_scale if history else None
-    limits = (*history.noise, np.nan if full is None else full, history.relief) if history else (0.0,) * 4
-    save_array(path, np.array(limits))
+    known = (*history.noise, np.nan if full is None else full, history.relief, history.cut_off) if history else (0,) * 5
+    save_array(path, np.array(known, np.float64))
 
 
 def _history(source: FrameSource, finder: Finder) -> History | None:
@@ -144,7 +144,8 @@ def _history(source: FrameSource, finder: Finder) -> History | None:
     with np.errstate(invalid="ignore", over="ignore"):  # pixels that hold no number
         history = look_back(moments)
     if history and finder.references:  # recorded values are cut off, and not corrected ones
-        return history._replace(full_scale=full_scale(high.astype(np.float32), frame, history.mask == 0))
+        full = full_scale(high.astype(np.float32), frame, history.mask == 0)
+        return history._replace(full_scale=full, cut_off=history.cut_off if full is None else 0)
     return history
 
 
@@ -187,6 +188,8 @@ class Gathered:
             borders = np.tile(self._whole, (self._n_frames, 1))
             borders[[int(number) for number in self._borders]] = list(self._borders.values())
             every = replace(every, borders=borders)
+        if known.history and known.history.cut_off:
+            return replace(every, cut_off=np.array([known.history.cut_off]))
         full = known.history.full_scale if known.history else None
         if full is None or not self._saturated.any() or self._higher > _HIGHER * self._saturated.sum():
             return every
