@@ -23,6 +23,7 @@ from tract_dask.run.verify import repair, verify
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings, SourceSettings
 from tract_dask.stages.convert.defects import finder_for
 from tract_dask.stages.convert.origin import is_converted, movie_key, remembered_source
+from tract_dask.stages.convert.reference_files import read_defects
 from tract_dask.stages.convert.references import check_references, read_references, without_effect
 from tract_dask.stages.convert.stage import remake
 from tract_dask.store.schema import REJECTED
@@ -187,6 +188,15 @@ def test_defects_as_a_list(camera, tmp_path, text):
     settings = ConvertSettings(**LAYOUT, find_defects=False, defects=str(tmp_path / "defects.txt"))
     pixels = open_movie(convert(camera.path("movie"), tmp_path / "movie.zarr", settings=settings)).pixels
     assert list(zip(*np.nonzero(pixels.mask), strict=True)) == [(5, 3), (9, 7)]
+
+
+@pytest.mark.parametrize("photometric", ["minisblack", "miniswhite"])
+def test_defects_as_a_mask_of_single_bits(camera, tmp_path, photometric):
+    """Where white is stored as 0, numbers are turned over: the faulty pixels are the fewer ones."""
+    mask = np.zeros(camera.faulty.shape, bool)
+    mask[[5, 9], [3, 7]] = True
+    tifffile.imwrite(tmp_path / "mask.tif", mask, photometric=photometric)
+    np.testing.assert_array_equal(read_defects(str(tmp_path / "mask.tif"), open_source(camera.path("movie"))), mask)
 
 
 @pytest.mark.parametrize(

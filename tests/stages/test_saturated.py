@@ -7,7 +7,7 @@ import pytest
 from conftest import Scene
 
 from tract_dask import convert, estimate_drift, find_columns, fit_columns, open_movie, rebin_frames, sum_image
-from tract_dask.settings import ConvertSettings, FitSettings
+from tract_dask.settings import ConvertSettings, FitSettings, SourceSettings
 from tract_dask.store.schema import REJECTED, Status
 
 
@@ -58,6 +58,15 @@ def test_amplitudes_and_places_are_as_if_nothing_was_cut_off(scene, movie):
     pulls = away / tracks["stderr"].sel(parameter=["x", "y"]).to_numpy()[good]
     assert np.abs(away.mean(axis=0)).max() < 4 * away.std() / np.sqrt(len(away))
     assert 0.6 < pulls.std() < 1.15
+
+
+@pytest.mark.parametrize("cut", [70, 10_000])
+def test_pixels_that_were_cut_off_before_they_were_summed_in_bins_are_counted(scene, cut, tmp_path):
+    np.save(tmp_path / "movie.npy", np.minimum(scene.counts(), cut))
+    movie = open_movie(convert(tmp_path / "movie.npy", tmp_path / "movie.zarr", source_settings=SourceSettings(bin=2)))
+    found = movie.pixels.counts(movie.shape[1:])
+    assert (found.get("cut off", 0) > 20) == (cut == 70)
+    assert movie.full_scale is None
 
 
 def test_a_sum_with_a_saturated_frame_has_no_limit(movie):

@@ -136,11 +136,13 @@ def _pixels(run: Survey) -> Iterator[Finding]:
         yield Finding("saturated", "Pixels are saturated", text, remedy)
     if cut_off := counts.get("cut off"):
         text = (
-            f"{count(cut_off, 'pixel')} have the same highest value again and again, each its own: they were "
-            "saturated, and the frames were corrected afterwards. What was above is cut off: heights of these columns "
-            "are too small, their widths and intensities too large."
+            f"{count(cut_off, 'pixel')} were saturated before the frames were corrected, or summed in bins: the "
+            "recorded pixels have the same highest value again and again. What was above is cut off: heights of these "
+            "columns are too small, their widths and intensities too large."
         )
-        remedy = "Convert the frames as they were recorded, with --gain-reference; or record with less beam."
+        remedy = (
+            "Convert the frames as they were recorded, without --bin, with --gain-reference; or record with less beam."
+        )
         yield Finding("saturated", "Pixels are saturated", text, remedy)
     if why := run.about.get("vacuum_unusable"):
         text = f"The vacuum is not used to measure the noise: {why}. The noise is that of the fits' residuals."

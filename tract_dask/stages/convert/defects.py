@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from ...kernels.borders import shown_part
 from ...kernels.defects import History, Moments, Noise, find_spikes, look_at_few, look_back
 from ...kernels.saturation import full_scale
+from ...readers.selection import SelectedSource
 from ...readers.source import FrameSource
 from ...settings.run import ConvertSettings
 from ...store.arrays import DamagedArrayError, load_saved, save_array
 from ...store.pixels import NO_PIXELS, Pixels
 from .reference_checks import check_fits
+from .reference_files import in_part
 from .references import read_references
 
 _SAMPLE_FRAMES = 32
@@ -143,10 +145,30 @@ def _history(source: FrameSource, finder: Finder) -> History | None:
                 high, highest = np.maximum(high, np.minimum(highest, frame)), np.maximum(highest, frame)
     with np.errstate(invalid="ignore", over="ignore"):  # pixels that hold no number
         history = look_back(moments)
+    if history and history.full_scale is None and (cut_off := _cut_off_in_bins(source)):
+        return history._replace(cut_off=cut_off)
     if history and finder.references:  # recorded values are cut off, and not corrected ones
         full = full_scale(high.astype(np.float32), frame, history.mask == 0)
         return history._replace(full_scale=full, cut_off=history.cut_off if full is None else 0)
     return history
+
+
+_BIN_FRAMES = 8
+"""Of so many frames it is looked whether pixels were cut off before they were summed in bins."""
+
+
+def _cut_off_in_bins(source: FrameSource) -> int:
+    """Return in how many bins of a frame, the most of a few, pixels have a largest value that cuts them off."""
+    if not isinstance(source, SelectedSource) or source.bin_px == 1:
+        return 0
+    numbers = np.unique(np.linspace(0, source.shape[0] - 1, _BIN_FRAMES).astype(int)).tolist()
+    frames = [source.whole.read(number, number + 1)[0] for number in (source.frames[k] for k in numbers)]
+    high = np.sort(np.stack(frames), axis=0)[-2:][0]
+    full = full_scale(high.astype(np.float32), frames[-1], np.ones(high.shape, np.bool_))
+    if full is None:
+        return 0
+    reached = [in_part(frame >= full, source).any(axis=2) for frame in frames]
+    return int(max(np.count_nonzero(one) for one in reached))
 
 
 def in_payload(found: dict[int, Pixels]) -> dict[str, Any]:

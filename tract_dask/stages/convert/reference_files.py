@@ -26,6 +26,8 @@ _LISTS = (".csv", ".txt", ".tsv")
 _LIST_BYTES = 4 << 20
 """Some hundred thousand pixels, which take a few seconds; more of them are a mask."""
 _BLOCK_BYTES = 64 << 20
+_MOST = 0.5
+"""A mask of a larger share of the pixels is the wrong way round."""
 _MEANING = "Give one pixel in a line: x, y, counted from 0 in whole frames, as the file of the movie has them"
 
 
@@ -91,6 +93,8 @@ def read_reference(place: str, movie: FrameSource) -> Image:
 def read_defects(place: str, movie: FrameSource) -> NDArray[np.bool_]:
     """Return which pixels are faulty, (y, x), of whole frames or of the part that is read: a list, or not 0 in a mask.
 
+    In a mask that stores white as 0, these are the fewer pixels.
+
     Raises
     ------
     SourceError
@@ -99,7 +103,9 @@ def read_defects(place: str, movie: FrameSource) -> NDArray[np.bool_]:
     if is_list(place):
         return _listed(Path(place), _whole(movie).shape[1:], movie.permit)
     mask: NDArray[np.bool_] = read_reference(place, movie) != 0
-    if mask.mean() > 0.5:
+    if mask.mean() > _MOST and _white_is_zero(place, movie):
+        mask = ~mask
+    if mask.mean() > _MOST:
         raise SourceError(
             "the mask leaves out most pixels",
             place,
@@ -108,6 +114,12 @@ def read_defects(place: str, movie: FrameSource) -> NDArray[np.bool_]:
             "Save it the other way round",
         )
     return mask
+
+
+def _white_is_zero(place: str, movie: FrameSource) -> bool:
+    """Tell whether an image stores white as 0, as masks of single bits often do: its numbers are then turned over."""
+    with closing(open_reference(place, permit=movie.permit)) as image:
+        return any("MinIsWhite" in note for note in image.metadata.notes)
 
 
 def in_part(image: NDArray[Any], movie: FrameSource) -> NDArray[Any]:
