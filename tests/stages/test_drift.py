@@ -403,3 +403,36 @@ def test_the_usual_score_is_the_median_of_all(count):
     scores = np.random.default_rng(count).normal(size=count)
     assert _middle(sorted(scores.tolist())) == np.median(scores)
     assert np.isnan(_middle([]))
+
+
+def marked(drift, edge=0.0, dose=8.0):
+    """A lattice, with vacuum above ``edge`` of the frame, that moves by ``drift``."""
+    chance, frames = np.random.default_rng(2), []
+    y = np.arange(SHAPE[0])[:, None]
+    for shift in drift:
+        image = lattice(shift)
+        frames.append(chance.poisson(dose * np.where(y < edge + shift[0], 0.5, image)))
+    return np.array(frames).astype(np.uint8)
+
+
+@pytest.mark.parametrize("step", [0.4, 0.6, 0.9, 1.2])
+@pytest.mark.parametrize("frames_per_shard", [24, 4])
+def test_an_edge_tells_a_step_that_is_longer_than_the_search(step, frames_per_shard):
+    truth = 0.2 * walk(24, 0.8)
+    truth[9:] += step * PERIOD * np.array([0.9, 0.3])
+    events = []
+    found = estimate_drift(MemoryMovie(marked(truth, 55.0), frames_per_shard), on_event=events.append)
+    assert np.abs(errors(found, truth)).max() < 1.0
+    told = [event for event in events if isinstance(event, Warned)]
+    assert bool(told) == (step > 0.8)  # along the edge it may then be a period shorter
+
+
+def test_a_step_that_nothing_tells_from_one_a_period_off_is_named():
+    truth = np.zeros((20, 2))
+    truth[12:, 0] = 0.45 * PERIOD
+    events = []
+    found = estimate_drift(MemoryMovie(marked(truth)), on_event=events.append)
+    told = [event.message for event in events if isinstance(event, Warned)]
+    assert found.attrs["doubtful"] == [12]
+    assert len(told) == 1
+    assert "frame 12 " in told[0]

@@ -22,6 +22,9 @@ Floats: TypeAlias = NDArray[np.float64]
 _DIRECT_LAGS = 9
 """So many shifts along a side, at most, are compared one by one, and more by FFT."""
 
+_ABOUT_AS_GOOD = 0.95
+"""Share of the best correlation."""
+
 LEAST_OVERLAP = 0.25
 """Smallest share of a side that a frame must have in common with the template."""
 
@@ -244,19 +247,91 @@ def search(frame: Image, template: Image, guess: tuple[float, float], radius: fl
     """
     centre = (round(guess[0]), round(guess[1]))
     reach = int(np.ceil(radius)) + 1
-    rows, columns = (slice(max(0, c + reach), min(n, n + c - reach)) for n, c in zip(frame.shape, centre, strict=True))
-    h, w = rows.stop - rows.start, columns.stop - columns.start
-    if h < LEAST_OVERLAP * frame.shape[0] or w < LEAST_OVERLAP * frame.shape[1]:
+    score = _scores(frame, template, centre, reach)
+    if score is None:
         return (*guess, 0.0)
-    piece = frame[rows, columns] - frame[rows, columns].mean(dtype=np.float64).astype(np.float32)
-    top, left = rows.start - centre[0] - reach, columns.start - centre[1] - reach
-    under = template[top : top + h + 2 * reach, left : left + w + 2 * reach]
-    score = _correlations(piece, under, 2 * reach + 1)[::-1, ::-1]
     lag = np.arange(-reach, reach + 1)
     distance = np.hypot(lag[:, None] + centre[0] - guess[0], lag[None, :] + centre[1] - guess[1])
     i, j = np.unravel_index(int(np.argmax(np.where(distance <= radius, score, -np.inf))), score.shape)
     dy, dx = (centre[0] + lag[i] + _vertex(score[:, j], int(i)), centre[1] + lag[j] + _vertex(score[i, :], int(j)))
     return float(dy), float(dx), float(score[i, j])
+
+
+class Rival(NamedTuple):
+    """Another shift at which a frame resembles a template: (dy, dx) in px, and both correlations."""
+
+    dy: float
+    dx: float
+    correlation: float
+    near: float
+    """At the shift that it is a rival of."""
+    step: float
+    """From the guess, px."""
+    next_step: float
+    """The same of the nearest other one that is about as good; infinite where there is none."""
+
+
+def search_rival(
+    frame: Image,
+    template: Image,
+    shift: tuple[float, float],
+    guess: tuple[float, float],
+    radius: float,
+    apart: tuple[float, float],
+) -> Rival | None:
+    """Return the best shift of ``frame`` within ``radius`` px of a guess that is apart from another shift.
+
+    Of shifts that are about as good it is the nearest one to the guess. Both are compared on the same pixels, each at
+    the top of a parabola through the correlations at whole pixels. None where the images overlap by less than a quarter
+    of a side.
+
+    Parameters
+    ----------
+    apart
+        Least distance from ``shift``, and that of one rival from another, px.
+    """
+    centre = (round(guess[0]), round(guess[1]))
+    reach = int(np.ceil(radius)) + 1
+    score = _scores(frame, template, centre, reach)
+    if score is None:
+        return None
+    lag = np.arange(-reach, reach + 1)
+
+    def away(y: float, x: float) -> Floats:
+        return np.asarray(np.hypot(lag[:, None] + centre[0] - y, lag[None, :] + centre[1] - x))
+
+    distance, step = away(*shift), away(*guess)
+    wanted = (distance >= apart[0]) & (step <= radius)
+    good = wanted & (score >= _ABOUT_AS_GOOD * np.max(np.where(wanted, score, -np.inf)))
+    first = np.unravel_index(int(np.argmin(np.where(good, step, np.inf))), score.shape)
+    from_first = away(lag[first[0]] + centre[0], lag[first[1]] + centre[1])
+    best = _top(np.where(wanted & (from_first < apart[1] / 2), score, -np.inf), score)
+    others = good & (away(best[0] + centre[0] - reach, best[1] + centre[1] - reach) >= apart[1])
+    near = _top(np.where(distance < 2, score, -np.inf), score)
+    y, x = best[0] + centre[0] - reach, best[1] + centre[1] - reach
+    length = float(np.hypot(y - guess[0], x - guess[1]))
+    return Rival(y, x, best[2], near[2], length, float(np.min(np.where(others, step, np.inf))))
+
+
+def _top(allowed: Floats, score: Floats) -> tuple[float, float, float]:
+    """Return where the highest of the allowed values is, by parabolas through the scores, and how high they are."""
+    i, j = map(int, np.unravel_index(int(np.argmax(allowed)), score.shape))
+    y, x, height = _vertex(score[:, j], i), _vertex(score[i, :], j), float(score[i, j])
+    for line, k, top in ((score[:, j], i, y), (score[i, :], j, x)):
+        height += 0.25 * float(line[k + 1] - line[k - 1]) * top if top else 0.0
+    return i + y, j + x, height
+
+
+def _scores(frame: Image, template: Image, centre: tuple[int, int], reach: int) -> Floats | None:
+    """Return Pearson's correlations at whole shifts up to ``reach`` from a centre; None where too little overlaps."""
+    rows, columns = (slice(max(0, c + reach), min(n, n + c - reach)) for n, c in zip(frame.shape, centre, strict=True))
+    h, w = rows.stop - rows.start, columns.stop - columns.start
+    if h < LEAST_OVERLAP * frame.shape[0] or w < LEAST_OVERLAP * frame.shape[1]:
+        return None
+    piece = frame[rows, columns] - frame[rows, columns].mean(dtype=np.float64).astype(np.float32)
+    top, left = rows.start - centre[0] - reach, columns.start - centre[1] - reach
+    under = template[top : top + h + 2 * reach, left : left + w + 2 * reach]
+    return _correlations(piece, under, 2 * reach + 1)[::-1, ::-1]
 
 
 def _correlations(piece: Image, under: Image, lags: int) -> Floats:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bisect import insort
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,12 +22,9 @@ from ...kernels.magnitude import unit_of
 from ...kernels.registration import (
     Floats,
     Image,
-    Spectrum,
     clean_image,
-    correlation,
     fold_image,
     measure_spectrum,
-    search,
 )
 from ...kernels.sums import Whole, add_shifted
 from ...progress import Sink, Warned
@@ -40,6 +36,7 @@ from ...store.keys import counted, stage_key
 from ...store.movie import Movie
 from ...store.provenance import processor
 from ...store.shards import Shard, Shards, split
+from .follow import MEMORY, TRUST, Follower, Level, MovingSum, whole
 
 Bools = NDArray[np.bool_]
 
@@ -59,10 +56,13 @@ SEARCH_LOSS = 0.75
 """For the search it is binned by 2 and 2 again as long as that loses less than this share of the information."""
 
 PASSES: dict[str, Fields] = {
-    "follow": {"drift": (None, 2), "placed": (None, 2), "trusted": (None,)},
+    "follow": {"drift": (None, 2), "placed": (None, 2), "trusted": (None,), "doubtful": (None,)},
     "refine": {"drift": (None, 2), "quality": (None,)},
 }
 """The two runs over the movie, and what a shard's payload holds after each."""
+
+MOST_NAMED = 12
+"""Frames that a warning names."""
 
 _BLOCK_BYTES = 16 << 20
 
@@ -70,14 +70,9 @@ _SAMPLES, _SAMPLE_FRAMES = 4, 2
 
 _FEWEST_PARTS, _PART_FRAMES = 8, 64
 
-_TRUST = 0.5
-"""Share of the usual resemblance below which a frame is not believed."""
-
 _FAINT, _BEYOND = 0.05, 6.0
 """A frame is lost that shows less than this share of the structure's usual power, and whose quality is more than so
 many standard deviations below the usual."""
-
-_MEMORY = 16
 
 
 def drift_dataset(drift: Floats, quality: Floats, movie: Movie, **attributes: Any) -> xr.Dataset:
@@ -93,42 +88,6 @@ def drift_dataset(drift: Floats, quality: Floats, movie: Movie, **attributes: An
 # --- one stage: journals, events -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Level:
-    """The level that drift is measured on.
-
-    Attributes
-    ----------
-    stored
-        Binning of the level as it is read; 1 for the movie itself.
-    fold
-        Further binning after it is read.
-    shape
-        (y, x) of a frame of the level.
-    spectrum
-        Of the movie's frames on this level.
-    search
-        Search range, px of the level.
-    search_fold
-        Further binning for the search.
-    unit
-        By which pixels are divided (:func:`unit_of`).
-    """
-
-    stored: int
-    fold: int
-    shape: tuple[int, int]
-    spectrum: Spectrum
-    search: float
-    search_fold: int
-    unit: float
-
-    @property
-    def bin(self) -> int:
-        """Pixels of the movie along one side of a pixel of the level."""
-        return self.stored * self.fold
-
-
 @dataclass
 class Track:
     """What is known of every frame between the two runs; px of the level.
@@ -141,21 +100,24 @@ class Track:
         (frames, 2) whole pixels by which the frame was moved into the sum.
     trusted
         (frames,) whether it is part of that sum.
+    doubtful
+        (frames,) whether the step to it may be wrong by a whole period.
     """
 
     drift: Floats
     placed: Whole
     trusted: Bools
+    doubtful: Bools
 
     def save(self, path: Path) -> None:
         """Write it as one table."""
-        save_array(path, np.column_stack([self.drift, self.placed, self.trusted]))
+        save_array(path, np.column_stack([self.drift, self.placed, self.trusted, self.doubtful]))
 
     @classmethod
     def load(cls, path: Path, shard: Shard) -> Track:
         """Return the part of a saved track that belongs to a shard."""
         table = load_array(path, mmap_mode="r")[shard.start : shard.stop]
-        return cls(np.array(table[:, :2]), table[:, 2:4].astype(np.int64), table[:, 4] > 0)
+        return cls(np.array(table[:, :2]), table[:, 2:4].astype(np.int64), table[:, 4] > 0, table[:, 5] > 0)
 
 
 def measure_drift(
@@ -178,6 +140,9 @@ def measure_drift(
         quality = np.concatenate([np.array(payloads[shard.index]["quality"]) for shard in shards])
         quality[lost_frames(quality)] = 0.0
         drift = _fill(_on_one_scale(found, track, shards), quality > 0.0)
+        doubtful = np.flatnonzero(track.doubtful & (quality > 0.0))
+        if doubtful.size:
+            on_event(Warned(doubt_in_words(doubtful.tolist())))
         if not (quality > 0.0).any():
             on_event(Warned("no frame shows a structure to measure drift by; drift is taken as zero"))
         drift = level.bin * (drift - np.median(drift, axis=0))
@@ -192,8 +157,23 @@ def measure_drift(
         bin=level.bin,
         processors=sorted({payload["processor"] for payload in payloads.values()}),
         search_px=level.search * level.bin,
+        doubtful=doubtful.tolist(),
         period_px=level.spectrum.period_px * level.bin if np.isfinite(level.spectrum.period_px) else None,
     )
+
+
+def doubt_in_words(frames: Sequence[int]) -> str:
+    """Return what is said of frames whose drift may be wrong by a whole period.
+
+    Examples
+    --------
+    >>> doubt_in_words([20])
+    'the step of the drift to frame 20 may be wrong by a whole period of the lattice: give it by --drift-csv'
+    """
+    named = ", ".join(map(str, frames[:MOST_NAMED])) + ("" if len(frames) <= MOST_NAMED else " …")
+    many = "s" if len(frames) > 1 else ""
+    steps = f"the step{many} of the drift to frame{many} {named} may be wrong by a whole period of the lattice"
+    return f"{steps}: give {'them' if many else 'it'} by --drift-csv"
 
 
 def _parts(movie: Movie) -> Shards:
@@ -225,7 +205,7 @@ def _choose_level(movie: Movie, settings: DriftSettings) -> Level:
     search_fold = 1
     while spectrum.loss(2 * search_fold) < SEARCH_LOSS and min(shape) // search_fold >= 2 * SMALLEST_SIDE:
         search_fold *= 2
-    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold, unit)
+    return Level(stored, fold, shape, spectrum, max(1.0, reach), search_fold, unit, settings.search_px is None)
 
 
 def _samples(movie: Movie, stored: int) -> list[Image]:
@@ -271,64 +251,22 @@ def _read(movie: Movie, stored: int, shard: Shard) -> Iterator[Image | None]:
 # --- the first run: following the movie ------------------------------------------------------------------------------
 
 
-class _MovingSum:
-    """A sum of images that move: it keeps itself where the newest is."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.total, self.origin = np.zeros(shape, np.float32), np.zeros(2, np.int64)
-
-    def add(self, image: Image, place: Whole) -> None:
-        """Add an image that lies at ``place``; move along where that is far from the origin."""
-        if (np.abs(place - self.origin) > np.array(self.total.shape[-2:]) / 8).any():
-            moved = np.zeros_like(self.total)
-            add_shifted(moved, self.total, self.origin - place)
-            self.total, self.origin = moved, place
-        add_shifted(self.total, image, place - self.origin)
-
-
-class _Follower:
-    """Follows images, binned for the search, each against the sum of those before; shifts in px of the level."""
-
-    def __init__(self, level: Level) -> None:
-        self.fold, self.reach = level.search_fold, level.search / level.search_fold
-        self.sum = _MovingSum((level.shape[0] // self.fold, level.shape[1] // self.fold))
-        self.empty, self.is_sure = True, True
-        self._recent: deque[float] = deque(maxlen=_MEMORY)
-
-    def follow(self, small: Image, guess: Floats) -> tuple[Floats, float]:
-        """Return the shift of an image near a guess, and its score; take it up unless it looks like no other."""
-        shift, score = guess / self.fold, 1.0
-        if not self.empty:
-            dy, dx, score = search(small, self.sum.total, tuple(shift - self.sum.origin), self.reach)
-            shift = np.array([dy, dx]) + self.sum.origin
-            self.is_sure = not self._recent or bool(score >= _TRUST * np.median(self._recent))
-            if not self.is_sure:
-                return guess, score
-            self._recent.append(score)
-        self.sum.add(small, _whole(shift))
-        self.empty = False
-        return shift * self.fold, score
-
-    def resemblance(self, small: Image, shift: Floats) -> float:
-        """Return Pearson's correlation of an image that lies at ``shift`` with the sum."""
-        return correlation(small, self.sum.total, _whole(shift / self.fold) - self.sum.origin)
-
-
 def _follow_shard(movie: Movie, level: Level, folder: Path, shard: Shard) -> Payload:
     """Follow the drift through a shard; leave the sum of its frames, moved by whole pixels, in ``folder``.
 
     Frames with less than half the usual score are not part of it. The first ones are judged again, by all of them
     together, before any is added: the very first had nothing to be compared with.
     """
-    follower, added = _Follower(level), _MovingSum((2, *level.shape))
+    follower, added = Follower(level), MovingSum((2, *level.shape))
     shifts, scores, guess = np.zeros((shard.frames, 2)), np.full(shard.frames, np.nan), np.zeros(2)
-    trusted = np.zeros(shard.frames, np.bool_)
+    trusted, doubtful = np.zeros((2, shard.frames), np.bool_)
     images = _frames(movie, level, shard)
     pairs = ((image, None if image is None else fold_image(image, level.search_fold)) for image in images)
-    opening = list(islice(pairs, _MEMORY))
+    opening = list(islice(pairs, MEMORY))
     for k, (_, small) in enumerate(opening):
         if small is not None:
             shifts[k], _ = guess, _ = follower.follow(small, guess)
+            doubtful[k] = follower.is_doubtful
     for k, (_, small) in enumerate(opening):
         if small is not None:
             scores[k] = follower.resemblance(small, shifts[k])
@@ -339,15 +277,16 @@ def _follow_shard(movie: Movie, level: Level, folder: Path, shard: Shard) -> Pay
             continue
         if k >= len(opening):
             shifts[k], scores[k] = guess, score = follower.follow(small, guess)
+            doubtful[k] = follower.is_doubtful
             if not np.isnan(score):
                 insort(ranked, score)
-        trusted[k] = scores[k] >= _TRUST * _middle(ranked)
+        trusted[k] = scores[k] >= TRUST * _middle(ranked)
         if trusted[k]:
             counted[0] = image
-            added.add(counted, _whole(shifts[k]))
+            added.add(counted, whole(shifts[k]))
     save_array(folder / f"{shard.index}.npy", added.total)
-    placed = _whole(shifts) - added.origin
-    return {"drift": shifts - added.origin, "placed": placed, "trusted": trusted}
+    placed = whole(shifts) - added.origin
+    return {"drift": shifts - added.origin, "placed": placed, "trusted": trusted, "doubtful": doubtful}
 
 
 def _middle(ranked: Sequence[float]) -> float:
@@ -361,8 +300,9 @@ def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], 
     Returns the track, and by how many pixels the sum of each shard is moved into that of all, (shards, 2).
     """
     n_frames = shards[-1].stop
-    track = Track(np.zeros((n_frames, 2)), np.zeros((n_frames, 2), np.int64), np.zeros(n_frames, np.bool_))
-    offsets, follower, last = np.zeros((len(shards), 2)), _Follower(level), np.zeros(2)
+    trusted, doubtful = np.zeros((2, n_frames), np.bool_)
+    track = Track(np.zeros((n_frames, 2)), np.zeros((n_frames, 2), np.int64), trusted, doubtful)
+    offsets, follower, last = np.zeros((len(shards), 2)), Follower(level), np.zeros(2)
     for shard in shards:
         drift, placed, trusted = (np.array(payloads[shard.index][name]) for name in ("drift", "placed", "trusted"))
         if not trusted.any():
@@ -377,11 +317,13 @@ def _chain(level: Level, shards: Sequence[Shard], payloads: dict[int, Payload], 
         if not follower.is_sure:  # a part without crystal: what its frames seem to do leads nowhere
             continue
         last = offset + drift[final]
+        track.doubtful[here] = payloads[shard.index]["doubtful"]
+        track.doubtful[shard.start + first] |= follower.is_doubtful
         track.drift[here], track.placed[here], track.trusted[here] = drift + offset, placed, trusted
     track.drift = _fill(track.drift, track.trusted)
     zero = np.rint(np.median(track.drift, axis=0))
     track.drift -= zero
-    places = _whole(offsets - zero)
+    places = whole(offsets - zero)
     track.placed += np.repeat(places, [shard.frames for shard in shards], axis=0)
     return track, places
 
@@ -456,8 +398,3 @@ def _fill(drift: Floats, good: Bools) -> Floats:
     frames, known = np.arange(len(drift)), np.flatnonzero(good)
     filled = np.stack([np.interp(frames, known, drift[known, axis]) for axis in range(2)], axis=1)
     return np.where(good[:, None], drift, filled)
-
-
-def _whole(shift: Floats) -> Whole:
-    """Return shifts in whole pixels."""
-    return np.rint(shift).astype(np.int64)
