@@ -11,7 +11,7 @@ from tract_dask.kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from tract_dask.kernels.windows import blur_variance
 from tract_dask.settings import ColumnSettings, FitSettings
 from tract_dask.stages.fit import job as fit_job
-from tract_dask.stages.fit.groups import plan_groups
+from tract_dask.stages.fit.groups import _exact, plan_groups
 from tract_dask.stages.groups import groups_of
 from tract_dask.store.columns import column_dataset, positions
 
@@ -258,3 +258,13 @@ def test_long_columns_are_not_two(movie_of):
     found = find_columns(sum_image(movie_of(frames)))
     assert found.sizes["column_id"] == len(x)
     assert not found["group"].to_numpy().any()
+
+
+def test_a_column_without_a_height_beside_another_states_what_is_known():
+    """The summed image may put the fit of a faint neighbour on zero: its place is then not seen by its window."""
+    mask = np.ones((21, 21), bool)
+    group = np.array([[0.0, 8, 10, 5, 5, 0, 8], [4.0, 13, 10, 5, 5, 0, 8]])
+    errors, left = _exact(group, mask, FitSettings(blur_sigma_px=2.0), None)
+    assert np.isfinite(errors[1, :3]).all()
+    assert np.isnan(errors[0, 1:3]).all()
+    assert 0.5 < left < 1

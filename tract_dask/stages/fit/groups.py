@@ -237,6 +237,8 @@ def _exact(
     flat = np.concatenate([own[:3] for own in slopes] + [slopes[0][3:4]])
     scale = np.sqrt((flat**2).sum(axis=1))
     images = np.zeros((len(flat), *mask.shape))
+    unseen = scale == 0  # places of a column without a height
+    scale[unseen] = 1
     images[:, mask] = flat / scale[:, None]
     inverse = np.linalg.pinv(images[:, mask] @ images[:, mask].T)
     reach = kernel.size // 2
@@ -255,7 +257,7 @@ def _exact(
     covariance = inverse @ meat @ inverse / np.outer(scale, scale)
     trace = whole if correlation is None else whole * _share(kernel, correlation)
     found = np.full((len(group), 7), np.nan)
-    variances = covariance.diagonal()
+    variances = np.where(unseen, np.nan, covariance.diagonal())
     found[:, [X, Y, AMPLITUDE]] = np.sqrt(variances[:-1]).reshape(-1, 3)
     found[:, BACKGROUND] = np.sqrt(variances[-1])
     return found, (trace - float(np.trace(inverse @ meat))) / whole
