@@ -140,9 +140,9 @@ def figures(
 ) -> None:
     """Draw the figures that the results of a run in the folder OUT allow.
 
-    They are sum, drift, fit, displacement, spread, tracks, jumps, fwhm, intensity, repeated_error and presence; with
-    --table, look_up and occupancy; and precision, intensity_dose and filters, which fit frames again, if --only names
-    them.
+    They are sum, drift, fit, displacement, spread, tracks, jumps, fwhm, intensity, repeated_error, strain,
+    polarisation, distances and presence; with --table, look_up and occupancy; and precision, intensity_dose and
+    filters, which fit frames again, if --only names them.
     """
     from ..plots.of_run import draw_figures
 

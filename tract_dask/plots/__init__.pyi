@@ -15,3 +15,6 @@ from .precision import plot_fwhm as plot_fwhm
 from .precision import plot_precision as plot_precision
 from .precision import plot_spread as plot_spread
 from .presence import plot_presence as plot_presence
+from .strain import plot_neighbour_distances as plot_neighbour_distances
+from .strain import plot_polarisation as plot_polarisation
+from .strain import plot_strain as plot_strain

@@ -19,8 +19,10 @@ from ..analysis.filters import compare_filters, filtered_region
 from ..analysis.intensity import intensity_against_dose, normalised, repeated_error, vacuum_level
 from ..analysis.lookup import read_table
 from ..analysis.occupancy import count_atoms
+from ..analysis.polarisation import neighbour_distances, polarisation
 from ..analysis.precision import precision_table
 from ..analysis.presence import appearances
+from ..analysis.strain import strain
 from ..errors import InputError, SettingsError, StoreError
 from ..settings.run import FitSettings
 from ..settings.toml import from_toml
@@ -168,6 +170,19 @@ def _occupancy(run: Run, path: Path) -> Figure:
     return plots.plot_occupancy(counts, run.tracks, run.summed, None, path)
 
 
+def _strain(run: Run, path: Path) -> Figure:
+    kind = "A" if "A" in run.tracks["kind"].to_numpy() else None
+    return plots.plot_strain(strain(run.tracks, kind), run.summed, path)
+
+
+def _polarisation(run: Run, path: Path) -> Figure:
+    known = set(run.tracks["kind"].to_numpy().astype(str))
+    if not {"A", "B"} <= known:
+        what, got = "columns of kinds A and B", ", ".join(sorted(filter(None, known))) or "columns of one kind"
+        raise InputError("there is no off-centring to draw", "figure polarisation", what, got)
+    return plots.plot_polarisation(polarisation(run.tracks), run.summed, path)
+
+
 FIGURES: dict[str, Callable[[Run, Path], Figure]] = {
     "sum": lambda run, path: plots.plot_sum(run.summed, path, columns=run.columns),
     "drift": lambda run, path: plots.plot_drift(run.tracks, path),
@@ -181,6 +196,9 @@ FIGURES: dict[str, Callable[[Run, Path], Figure]] = {
     "repeated_error": lambda run, path: plots.plot_repeated_error(
         repeated_error(run.intensities), run.tracks, run.summed, path
     ),
+    "strain": _strain,
+    "polarisation": _polarisation,
+    "distances": lambda run, path: plots.plot_neighbour_distances(neighbour_distances(run.tracks), run.summed, path),
     "presence": lambda run, path: plots.plot_presence(run.tracks, path, events=appearances(run.tracks)),
     "look_up": lambda run, path: plots.plot_look_up(run.look_up, path),
     "occupancy": _occupancy,
