@@ -177,6 +177,15 @@ def test_what_differs_from_what_was_said_is_a_warning_with_a_remedy(gain, offset
     assert all("auto" in one["remedy"] for one in found)
 
 
+@pytest.mark.parametrize(("offset", "told"), [(-1.0, True), (-0.3, False), (None, False)])
+def test_a_dark_image_that_was_subtracted_twice_is_told_where_read_noise_is_known(offset, told):
+    """Level 2.2 above it: 1 is a third of the noise, which may be read noise unless the third moment says otherwise."""
+    camera = Camera(per_electron=1.0, per_electron_stderr=0.01, zero=-1.0, zero_stderr=0.05, offset=offset)
+    found = list(camera_findings(camera, 1.0, 0.0, 2.2, dark=True))
+    assert [one["title"] for one in found] == ["The offset is not what was said"] * told
+    assert all("without --dark" in one["remedy"] and "subtracted again" in one["text"] for one in found)
+
+
 def test_a_camera_goes_through_its_attribute_and_to_sums():
     camera = Camera(per_electron=7.0, zero=90.0, zero_stderr=1.0, offset=95.0, read_noise=3.0, correlation=((1.0,),))
     assert Camera.of(camera.to_attribute()) == camera

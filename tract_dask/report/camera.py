@@ -31,6 +31,8 @@ _SHARP_PX, _NARROWEST_PX, _DOUBT = 1.3, 0.3, 1.5
 is known to this factor."""
 _SURE = 5.0
 """Standard errors by which it must be off as well; columns that move by themselves leave more than one."""
+_TOLD = 0.2
+"""An offset that is told from read noise, and is off by this share of the level above it, is worth a warning, too."""
 _READ_SHARE = 0.5
 """An offset that would leave more than this share of the noise to the read noise is doubted."""
 
@@ -94,7 +96,9 @@ def faint_words(faint: NDArray[np.float64], accepted: NDArray[np.int64]) -> dict
     return {"title": "Columns are faint in single frames", "text": text, "remedy": remedy}
 
 
-def camera_findings(camera: Camera, gain: float, offset: float, level: float) -> Iterator[dict[str, Any]]:
+def camera_findings(
+    camera: Camera, gain: float, offset: float, level: float, *, dark: bool = False
+) -> Iterator[dict[str, Any]]:
     """Yield what there is to say of gain and offset: title, text, remedy and whether it is serious.
 
     Parameters
@@ -103,6 +107,8 @@ def camera_findings(camera: Camera, gain: float, offset: float, level: float) ->
         As the movie has them: counts for a detector unit, and detector units without electrons.
     level
         The usual pixel, detector units.
+    dark
+        Whether a dark image was subtracted.
     """
     if camera.per_electron is None or camera.zero is None:
         text = f"Gain and offset could not be compared with the noise: {camera.reason}."
@@ -121,10 +127,14 @@ def camera_findings(camera: Camera, gain: float, offset: float, level: float) ->
     below, share = camera.zero - offset, (offset - camera.zero) / above if above > 0 else 0.0
     known = camera.offset if camera.offset is not None else camera.zero
     sure = _SURE * (camera.zero_stderr or 0)
-    if above > 0 and ((below > OFF * above and below > sure) or (share > _READ_SHARE and -below > sure)):
+    told_apart = camera.offset is not None and abs(camera.offset - offset) > max(_TOLD * above, sure)
+    if above > 0 and ((below > OFF * above and below > sure) or (share > _READ_SHARE and -below > sure) or told_apart):
         text = (
             f"The noise tells of an offset of {known:.4g} detector units, where the usual pixel has {level:.4g}; "
             f"{offset:.4g} was said. Backgrounds and intensities in units of vacuum are wrong by the difference."
         )
         remedy = "Run the same command again with --offset auto, or with the number that the camera's maker gives."
+        if dark and known < offset:
+            text += " The frames were dark-corrected before, as it seems, and the dark image was subtracted again."
+            remedy = "Run again without --dark; or with --offset auto, where the dark image is right."
         yield {"title": "The offset is not what was said", "text": text, "remedy": remedy}

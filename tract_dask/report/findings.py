@@ -107,12 +107,12 @@ def _camera(run: Survey) -> Iterator[Finding]:
     said = {"gain": 1.0, "offset": 0.0} | run.about["movie"]
     image = run.summed["image"].to_numpy()[run.summed["exposure"].to_numpy() > 0]
     level = float(np.median(image)) / said["gain"] + said["offset"] if image.size else 0.0
-    camera = Camera.of(run.summed.attrs)
+    camera, arrays = Camera.of(run.summed.attrs), run.left_out.get("arrays", ())
     drift = run.frames["drift_measured"].to_numpy()
     of_columns = fine_columns(run.tracks, drift, run.summed["image"].shape) if camera.fixed_pattern else 0.0
     if words := pattern_words(camera, of_columns):
         yield Finding("gain_pattern", **words)
-    for words in camera_findings(camera, said["gain"], said["offset"], level):
+    for words in camera_findings(camera, said["gain"], said["offset"], level, dark="dark" in arrays):
         yield Finding("camera", **words)
 
 
