@@ -5,7 +5,7 @@ import pytest
 
 from tract_dask.kernels.gaussian.fit import fit_gaussians
 from tract_dask.kernels.gaussian.model import evaluate
-from tract_dask.stages.columns.slopes import background_slopes, drawn_by_slopes
+from tract_dask.stages.columns.slopes import background_slopes, drawn_by_slopes, without_slopes
 
 WINDOW, SIGMA, HEIGHT = 21, 5.0, 2.0
 
@@ -65,3 +65,17 @@ def test_slopes_need_columns_around():
     assert not found[9:].any()
     in_a_row = np.column_stack([40.0 * np.arange(12), np.full(12, 7.0)])
     np.testing.assert_allclose(background_slopes(in_a_row, 0.02 * in_a_row[:, 0])[:, 0], 0.02, atol=1e-9)
+
+
+def test_an_image_loses_a_background_that_rises_and_nothing_else():
+    """Less than 5 % of what rises is left; the planes flatten its curve. An even image is the same object."""
+    places = _lattice()
+    y, x = np.mgrid[:230, :300].astype(float)
+    rising = 8 + 0.02 * x - 0.01 * y + 5e-5 * x**2
+    fit = np.zeros((len(places), 7))
+    fit[:, 1:3] = places
+    fit[:, 6] = 8 + 0.02 * places[:, 0] - 0.01 * places[:, 1] + 5e-5 * places[:, 0] ** 2
+    inside = (slice(60, 170), slice(100, 220))
+    assert np.ptp(without_slopes(rising, fit, 40.0)[inside]) < 0.05 * np.ptp(rising[inside])
+    fit[:, 6] = 8.0
+    assert without_slopes(rising, fit, 40.0) is rising

@@ -16,6 +16,7 @@ from .group_fits import Summed, fit_touching
 from .relief import damping
 from .scene import Scene
 from .singles import SIGNIFICANT, Fits, Seeds, fitted_alone
+from .slopes import without_slopes
 from .touching import Image, touching_columns
 from .twins import twins_of
 from .window_size import neighbour_distance
@@ -95,7 +96,8 @@ def _with_missed(
     variance = blur_variance(fits.blur_sigma_px)
     lattice = next(iter(scene.lattices.values()), None)
     cell = max(spacing, lattice.spacing) if lattice and not crowded else spacing
-    image = Image(scene.counts, scene.known, scene.noise, scene.sign)
+    flat = without_slopes(scene.counts, columns, spacing)  # one side of a slope is no column
+    image = Image(flat, scene.known, scene.noise, scene.sign)
     found, parent = touching_columns(image, blurred(columns, -variance), cell / 2)
     n, added = len(columns), len(found) - len(columns)
     if not added:

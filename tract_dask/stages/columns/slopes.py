@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from .relief import expanded
 
 Floats = NDArray[np.float64]
 
@@ -37,22 +38,47 @@ def background_slopes(places: Floats, background: Floats) -> Floats:
     known = np.flatnonzero(np.isfinite(places).all(axis=1) & np.isfinite(background))
     if len(known) < _FEWEST:
         return slopes
+    plane, doubt = _planes(places[known], background[known], places[known])
+    found = plane[:, 1:]
+    chance = np.einsum("ni,nij,nj->n", found, np.linalg.pinv(doubt, hermitian=True), found)
+    slopes[known] = np.where((chance > _SURE**2)[:, None], found, 0)
+    return slopes
+
+
+def _planes(places: Floats, level: Floats, at: Floats) -> tuple[Floats, Floats]:
+    """Return planes through the levels of the nearest columns: level and slopes (n, 3) at places ``at`` (n, 2).
+
+    The second is the covariance of the slopes (n, 2, 2).
+    """
     from scipy.spatial import cKDTree  # takes its time, and workers hardly need it
 
-    _, around = cKDTree(places[known]).query(places[known], k=min(_AROUND, len(known)))
-    offsets = places[known][around] - places[known][:, None]
+    _, nearest = cKDTree(places).query(at, k=min(_AROUND, len(places)))
+    around = np.asarray(nearest, np.int64)
+    offsets = places[around] - at[:, None]
     unit = float(np.sqrt(np.square(offsets).mean())) or 1.0
     offsets /= unit
     design = np.concatenate([np.ones((*offsets.shape[:2], 1)), offsets], axis=2)
     inverse = np.linalg.pinv(np.einsum("nki,nkj->nij", design, design), rcond=1e-6, hermitian=True)
-    levels = background[known][around]
-    plane = np.einsum("nij,nkj,nk->ni", inverse, design, levels)
-    left = levels - np.einsum("nki,ni->nk", design, plane)
+    plane = np.einsum("nij,nkj,nk->ni", inverse, design, level[around])
+    left = level[around] - np.einsum("nki,ni->nk", design, plane)
     scatter = np.square(left).sum(axis=1) / (design.shape[1] - 3)
-    found, doubt = plane[:, 1:], inverse[:, 1:, 1:] * scatter[:, None, None]
-    chance = np.einsum("ni,nij,nj->n", found, np.linalg.pinv(doubt, hermitian=True), found)
-    slopes[known] = np.where((chance > _SURE**2)[:, None], found / unit, 0)
-    return slopes
+    return plane / [1, unit, unit], inverse[:, 1:, 1:] * scatter[:, None, None] / unit**2
+
+
+def without_slopes(image: Floats, fit: Floats, spacing: float) -> Floats:
+    """Return an image (y, x) less the level of a background that rises; the image itself where that is not sure.
+
+    The level is that of planes through the backgrounds of the nearest columns, every half ``spacing`` (px), and linear
+    between. ``fit`` (columns, 7) as in :func:`drawn_by_slopes`.
+    """
+    if not background_slopes(fit[:, [X, Y]], fit[:, BACKGROUND]).any():
+        return image
+    known = fit[np.isfinite(fit[:, [X, Y, BACKGROUND]]).all(axis=1)]
+    step = max(1, int(spacing / 2))
+    rows, columns = (np.arange(0, side + step, step, dtype=np.float64) for side in image.shape)
+    nodes = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    level = _planes(known[:, [X, Y]], known[:, BACKGROUND], nodes)[0][:, 0].reshape(len(rows), len(columns))
+    return np.asarray(image - expanded(level, image.shape, step, (0.0, 0.0)))
 
 
 def drawn_by_slopes(fit: Floats, window_px: int) -> Floats:
