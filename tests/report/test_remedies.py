@@ -11,6 +11,7 @@ from conftest import Scene
 from test_report import Run
 
 from tract_dask import convert, find_columns, fit_columns, open_movie
+from tract_dask.analysis.jumps import noise_factor
 from tract_dask.report import findings as room
 from tract_dask.report.findings import findings
 from tract_dask.report.survey import gathered, survey
@@ -96,11 +97,24 @@ def told(drifting, columns=None, drift=None, **settings):
     columns = scene.columns(settings.get("blur_sigma_px", 2.0)) if columns is None else columns
     drift = scene.drift_dataset() if drift is None else drift
     fit = FitSettings(**settings)
-    tracks = fit_columns(movie, columns, drift, fit, summed=scene.summed()).compute()
+    return told_of(known, fit_columns(movie, columns, drift, fit, summed=scene.summed()), fit)
+
+
+def told_of(known, tracks, fit=None):
+    """Return what is known of these tracks, by name; ``known`` has the rest of the run."""
+    tracks = tracks.compute()
     tracks.attrs["pixel_size_pm"] = 4.0
     numbers, frames, series = gathered(tracks, None)
-    numbers = numbers.assign(dict.fromkeys(("residual", "p_value"), ("column_id", np.full(len(columns.x_ref), np.nan))))
-    run = replace(known, tracks=tracks, columns=numbers, frames=frames, series=series, settings=RunSettings(fit=fit))
+    nothing = ("column_id", np.full(tracks.sizes["column_id"], np.nan))
+    run = replace(
+        known,
+        tracks=tracks,
+        columns=numbers.assign(dict.fromkeys(("residual", "p_value"), nothing)),
+        frames=frames,
+        series=series,
+        settings=RunSettings(fit=fit or FitSettings()),
+        factor=float(np.median(noise_factor(tracks)["factor"])),
+    )
     return {finding.name: finding for finding in findings(run)}
 
 

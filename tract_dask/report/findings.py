@@ -14,7 +14,7 @@ from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
-from .camera import camera_findings, faint_words, fine_columns, pattern_words
+from .camera import camera_findings, faint_words, fine_columns, free_words, pattern_words
 from .crystal import left_out_words, motion_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
@@ -336,7 +336,8 @@ def _why_no_errors(run: Survey) -> tuple[str, str]:
 def _errors(run: Survey) -> Iterator[Finding]:
     if run.accepted and not np.isfinite(run.columns["expected"]).any():
         yield Finding("no_errors", "No errors are known", *_why_no_errors(run), serious=False)
-    if words := faint_words(run.columns["faint"].to_numpy(), run.columns["accepted"].to_numpy()):
+    number, free = run.columns["accepted"].to_numpy(), run.tracks.attrs.get("shape") == "free"
+    if words := free_words(run.scatter, number) if free else faint_words(run.columns["faint"].to_numpy(), number):
         yield Finding("faint", **words)
     if np.isfinite(run.factor) and run.frames.sizes["frame"] > 2 and not FACTOR[0] <= run.factor <= FACTOR[1]:
         more = run.factor > 1

@@ -94,6 +94,17 @@ class Survey:
         return counts
 
     @property
+    def scatter(self) -> Floats:
+        """Relative standard deviation of a column's intensity in single frames, (columns,), by successive values."""
+        values = self.series["mean"].sel(quantity="intensity").to_numpy()
+        steps = np.diff(values, axis=0)
+        known = np.isfinite(steps)
+        squares = np.where(known, steps, 0.0) ** 2
+        number = np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+        variance = self.series.attrs["frames"] * squares.sum(axis=0) / (2 * number)
+        return np.asarray(np.sqrt(variance) / np.abs(self.columns["intensity"].to_numpy()))
+
+    @property
     def accepted(self) -> int:
         """Fits that were accepted."""
         return int(self.columns["accepted"].sum())

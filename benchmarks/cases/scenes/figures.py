@@ -8,17 +8,22 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
 import tract_dask as td
+from tract_dask.analysis.intensity import mean_intensity
+from tract_dask.kernels.gaussian.intensity import INTENSITY_SCALE
 from tract_dask.settings import ColumnSettings
 from tract_dask.store.columns import positions
 from tract_dask.store.schema import REJECTED
 
 from ..common import track, work_folder
+from .sampling import scene_of
 from .scenes import dark_columns, lost_frames
 
 FRAMES = 24
 SIZE = (8.0, 3.4)
+_ERRORS = "errors of the frames alone", "with the shape's"
 
 
 def contrast(place: Path) -> None:
@@ -68,6 +73,29 @@ def lost(place: Path) -> None:
     figure.savefig(place / "trust_lost_frames.png", dpi=130)
 
 
+def shapes(place: Path) -> None:
+    """Draw mean intensities of equal columns, with errors of the means without that of the shape and with it."""
+    scene, judged = scene_of(20.0, 3.0, seed=7)
+    with work_folder() as folder:
+        tracks, _ = track(scene.counts(7), folder, {}, {})
+    drift = tracks["drift"].sel(axis=["x", "y"]).to_numpy()
+    still = np.median(scene.places[:, judged] - drift[:, None], axis=0)
+    which = cKDTree(positions(tracks)).query(still)[1]
+    mean = mean_intensity(td.accepted(tracks).isel(column_id=np.sort(which))).isel(frame=0)
+    true = INTENSITY_SCALE["paper"] * 2 * np.pi * scene.amplitudes[0, 0] * scene.sigma**2
+    alone, both = mean["stderr"], np.hypot(mean["stderr"], mean["shape_stderr"])
+    figure = Figure(SIZE, layout="constrained")
+    for axes, error, name in zip(figure.subplots(1, 2, sharey=True), (alone, both), _ERRORS, strict=True):
+        number = np.arange(1, mean.sizes["column_id"] + 1)
+        axes.axhline(1, color="0.7", lw=3)
+        axes.errorbar(number, mean["intensity"] / true, error / true, fmt="k.", ecolor="tab:blue", lw=1.5)
+        pull = float(((mean["intensity"] - mean["intensity"].mean()) / error).std())
+        axes.set_title(f"{name}: scatter / error = {pull:.1f}", fontsize=9)
+        axes.set(xlabel="column")
+    figure.axes[0].set(ylabel="mean intensity / true intensity")
+    figure.savefig(place / "trust_shapes.png", dpi=130)
+
+
 def main() -> None:
     """Draw all."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -76,6 +104,7 @@ def main() -> None:
     mpl.use("Agg")
     contrast(folder)
     lost(folder)
+    shapes(folder)
 
 
 if __name__ == "__main__":

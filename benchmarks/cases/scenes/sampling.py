@@ -29,7 +29,7 @@ ELECTRONS = 12_000.0
 """Height of a column times the spacing squared, counts px^2; the background is a third of the height."""
 HEADINGS = (
     *("spacing, px", "sigma, px", "window, px", "blur, px", "fit", "fits", "lost columns", "accepted"),
-    *("sd / bound", "pull of x, y", "intensity", "its pull within a column", "scatter of columns / error"),
+    *("sd / bound", "pull of x, y", "intensity", "its pull within a column", "pull of means of columns"),
 )
 WAYS: dict[str, dict[str, Any]] = {"lsq": {}, "lsq, free": {"shape": "free"}, "poisson": {"estimator": "poisson"}}
 
@@ -63,10 +63,12 @@ def row(name: str, tracks: xr.Dataset, scene: Scene, judged: NDArray[np.int64], 
     intensity = np.where(good, tracks["intensity"].to_numpy()[:, which] / volume, np.nan)
     stated = np.where(good, tracks["intensity_stderr"].to_numpy()[:, which] / volume, np.nan)
     of_columns, usual = np.nanmean(intensity, axis=0), np.sqrt(np.nanmean(stated**2))
+    of_means = usual * np.sqrt(1 / good.sum(axis=0) + tracks["shape_error"].to_numpy()[which] ** 2)
+    of_columns_pull = ((of_columns - of_columns.mean()) / of_means).std()
     return (
         f"| {name} | {good.size} | {lost} | {good.mean():.1%} | {errors.std() / bound_px:.3f}"
         f" | {np.sqrt((pulls**2).mean()):.2f} | {np.nanmean(intensity):.3f}"
-        f" | {np.nanstd(intensity - of_columns) / usual:.2f} | {of_columns.std() / usual:.2f} |"
+        f" | {np.nanstd(intensity - of_columns) / usual:.2f} | {of_columns_pull:.2f} |"
     )
 
 
