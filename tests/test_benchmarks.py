@@ -1,6 +1,7 @@
 """The benchmark: its windows and scores against theory, and the whole of it on small data, peers included."""
 
 import json
+import re
 import subprocess
 from pathlib import Path
 
@@ -127,3 +128,11 @@ def test_the_document_shows_the_published_figures():
     assert published["sections"].keys() == SECTIONS.keys()
     text = DOCUMENT.read_text(encoding="utf-8")
     assert f"{report.BEGIN}\n\n{report.markdown(published)}\n{report.END}" in text
+
+
+def test_the_table_of_scenes_maps_warnings_that_there_are():
+    from benchmarks.cases.scenes.table import EXPLAINS
+
+    listed = set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "trust.md").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(EXPLAINS) <= listed
+    assert set().union(*EXPLAINS.values()) == {"missing", "false", "bias", "pull", "absent", "intensity"}
