@@ -10,12 +10,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from . import kernel, machine, plots, report, runs, scheduler, stages, startup
+from . import kernel, machine, pairs, plots, report, runs, scheduler, stages, startup
 from .environment import HERE
 from .sizes import FULL, SMALL, Size
 
 SECTIONS = {
     "kernel": kernel.run,
+    "pairs": pairs.run,
     "startup": startup.run,
     "stages": stages.run,
     "runs": runs.run,

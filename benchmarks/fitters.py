@@ -47,7 +47,7 @@ class Fitter:
         return f"{'tract_dask' if self.peer == 'ours' else self.peer} {self.method}"
 
 
-LSQ, POISSON = Fitter("ours", "lsq"), Fitter("ours", "poisson")
+LSQ, POISSON, PAIRS = Fitter("ours", "lsq"), Fitter("ours", "poisson"), Fitter("ours", "pairs")
 
 PEERS = (
     Fitter("picasso", "lsq guess", 0.2),

@@ -93,7 +93,7 @@ def draw(case: Case, n: int, seed: int = 0) -> Windows:
 
 
 def score(centres: Floats, fine: NDArray[np.bool_], windows: Windows) -> dict[str, float | None]:
-    """Return how good the centres (n, 2), (x, y), of the first n windows are.
+    """Return how good the centres (n, 2), (x, y), of the first n windows are; of pairs (n, 2, 2).
 
     Returns
     -------
@@ -103,15 +103,15 @@ def score(centres: Floats, fine: NDArray[np.bool_], windows: Windows) -> dict[st
         standard deviation that chance gives it (both None where all are lost); ``windows``: n.
     """
     n = len(centres)
-    error = centres - windows.truth[:n, 1:3]
-    good = fine & np.all(np.abs(error) < LOST_PX, axis=1)
+    error = centres - windows.truth[:n, ..., 1:3]
+    good = fine & np.all(np.abs(error).reshape(n, -1) < LOST_PX, axis=1)
     if not good.any():
         return {"success": 0.0, "precision": None, "precision_sd": None, "windows": n}
     precision = np.sqrt((error[good] ** 2).mean() / windows.crlb[:n][good].mean())
     return {
         "success": float(good.mean()),
         "precision": float(precision),
-        "precision_sd": float(precision / np.sqrt(4 * good.sum())),
+        "precision_sd": float(precision / np.sqrt(2 * error[good].size)),
         "windows": n,
     }
 

@@ -286,10 +286,9 @@ def _intensities(
     if not (n > 0).any():
         return np.nan, np.nan
     shares, errors = (np.where(judged, values, 0)[:, n > 0] for values in (shares * np.sign(true), errors))
-    shape = tracks["shape_error"].to_numpy()[which][n > 0] if "shape_error" in tracks else 0.0
     n = n[n > 0]
-    found, square = float(np.median(shares.sum(axis=0) / n)), (errors**2).sum(axis=0) / n
-    return found, abs(found - 1) / float(np.median(np.sqrt(square * (1 / n + shape**2))))
+    found = float(np.median(shares.sum(axis=0) / n))
+    return found, abs(found - 1) / float(np.median(np.sqrt((errors**2).sum(axis=0)) / n))
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
+from atomap.atom_finding_refining import fit_atom_positions_gaussian
 from atomap.atom_position import Atom_Position
 
 from benchmarks.peers.protocol import Found, Task, mosaic, serve
@@ -30,7 +31,28 @@ def prepare(task: Task) -> Callable[[], Found]:
     return work
 
 
+def pairs(task: Task) -> Callable[[], Found]:
+    """Return both members' Gaussians, fitted at the same time; their shapes are free, as always there."""
+    image, middles = mosaic(task)
+    side = task.windows.shape[1]
+
+    def work() -> Found:
+        centres, fine = np.empty((len(middles), 2, 2)), np.empty(len(middles), np.bool_)
+        for number, (middle, both) in enumerate(zip(middles, task.start, strict=False)):
+            corner = middle[::-1] - (side - 1) / 2
+            atoms = [Atom_Position(*(corner + one[1:3]), *one[3:5]) for one in both]
+            found = fit_atom_positions_gaussian(atoms, image, rotation_enabled=True, mask_radius=side // 3)
+            fine[number] = found is not False and all(fit is not False for fit in np.atleast_1d(found))
+            if fine[number]:
+                centres[number] = [np.array([fit.centre_x.value, fit.centre_y.value]) - corner for fit in found]
+            else:
+                centres[number] = both[:, 1:3]
+        return Found(centres, fine)
+
+    return work
+
+
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     logging.getLogger("hyperspy").setLevel(logging.ERROR)
-    serve({"2d gaussian": prepare})
+    serve({"2d gaussian": prepare, "pairs": pairs})

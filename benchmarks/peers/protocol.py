@@ -29,6 +29,7 @@ class Task:
         (n, side, side) float32 counts.
     start, lower, upper
         (n, 7) amplitude, x, y, sigma_a, sigma_b, theta, background of Equation 1; px from the first pixel's centre.
+        Of pairs (n, 2, 7), with the shapes that they have.
     """
 
     windows: NDArray[np.float32]
@@ -50,7 +51,7 @@ class Task:
 
 
 class Found(NamedTuple):
-    """What a fitter found: centres (n, 2), (x, y), and whether it says of each that all is fine.
+    """What a fitter found: centres (n, 2), (x, y), of pairs (n, 2, 2), and whether it says of each that all is fine.
 
     A fitter may do fewer windows than it was given.
     """

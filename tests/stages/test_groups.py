@@ -11,7 +11,7 @@ from tract_dask.kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from tract_dask.kernels.windows import blur_variance
 from tract_dask.settings import ColumnSettings, FitSettings
 from tract_dask.stages.fit import job as fit_job
-from tract_dask.stages.fit.groups import _exact, plan_groups
+from tract_dask.stages.fit.groups import plan_groups
 from tract_dask.stages.groups import groups_of
 from tract_dask.store.columns import column_dataset, positions
 
@@ -260,11 +260,19 @@ def test_long_columns_are_not_two(movie_of):
     assert not found["group"].to_numpy().any()
 
 
-def test_a_column_without_a_height_beside_another_states_what_is_known():
-    """The summed image may put the fit of a faint neighbour on zero: its place is then not seen by its window."""
-    mask = np.ones((21, 21), bool)
-    group = np.array([[0.0, 8, 10, 5, 5, 0, 8], [4.0, 13, 10, 5, 5, 0, 8]])
-    errors, left = _exact(group, mask, FitSettings(blur_sigma_px=2.0), None)
-    assert np.isfinite(errors[1, :3]).all()
-    assert np.isnan(errors[0, 1:3]).all()
-    assert 0.5 < left < 1
+def test_groups_that_are_larger_than_a_frame_are_fitted_together(movie_of):
+    rng = np.random.default_rng(8)
+    places = np.array([[7.4, 12.2], [15.8, 11.6]])
+    truth = places + rng.normal(0, 0.1, (60, 2, 2))
+    known = columns_at(places)
+    moved = np.tile(known, (60, 1, 1))
+    moved[..., [X, Y]] = truth
+    expected = gaussian_image(moved, (24, 24)).sum(axis=1) - 20
+    columns = column_dataset(places, fit=known, group=[1, 1])
+    columns.attrs |= {"window_px": 15, "blur_sigma_px": 0.0}
+    tracks = fit_columns(
+        movie_of(rng.poisson(expected).astype(np.uint16)), columns, settings=replace(SETTINGS, blur_sigma_px=0.0)
+    ).compute()
+    errors = tracks["fit"].sel(parameter=["x", "y"]).to_numpy() - truth
+    assert (tracks["status"] == 0).mean() > 0.95
+    assert np.abs(np.nanmean(errors, axis=0)).max() < 3 * np.nanstd(errors) / np.sqrt(60)

@@ -105,10 +105,10 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        ``frame``, ``time``, ``column_id``, ``kind``, ``x_pm`` and ``y_pm`` (where the size of a pixel is known), then
-        the variables of the results under their names: the parameters of the fit, ``x_stderr`` for the standard error
-        of x, ``drift_y`` for the y axis of drift; ``shape_error`` of the column; ``accepted`` tells which fits are.
-        Units are those of the results.
+        ``frame``, ``time``, ``column_id``, ``kind``, ``group``, ``unresolved``, ``x_pm`` and ``y_pm`` (where the size
+        of a pixel is known), then the variables of the results under their names: the parameters of the fit,
+        ``x_stderr`` for the standard error of x, ``drift_y`` for the y axis of drift; ``shape_error`` of the column;
+        ``accepted`` tells which fits are. Units are those of the results.
         What is measured in vacuum, and motions that are not undone, are left out.
     """
     tracks = tracks.compute()
@@ -119,6 +119,8 @@ def table(tracks: xr.Dataset) -> pd.DataFrame:
         "column_id": np.tile(tracks["column_id"].to_numpy(), n_frames),
         "kind": np.tile(schema.texts(tracks["kind"].to_numpy()), n_frames),
     }
+    of_groups = [variable.name for variable in schema.OF_GROUPS if variable.name in tracks]
+    columns |= {name: np.tile(tracks[name].to_numpy(), n_frames) for name in of_groups}
     scale = tracks.attrs.get("pixel_size_pm")
     for axis in ("x", "y") if scale else ():
         columns[f"{axis}_pm"] = scale * tracks["fit"].sel(parameter=axis).to_numpy().ravel()

@@ -18,7 +18,7 @@ from .camera import camera_findings, faint_words, fine_columns, free_words, patt
 from .crystal import left_out_words, motion_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
-from .touching import alone_words, unresolved_words
+from .touching import alone_words, half_words, unresolved_words
 
 LOW_SHARE = 0.9
 """Fewer accepted fits than this share of all that were made are worth a warning."""
@@ -401,6 +401,8 @@ def _crystal(run: Survey) -> Iterator[Finding]:
         yield Finding("moving_columns", **words)
     if words := alone_words(run):
         yield Finding("touching_alone", **words)
+    if words := half_words(run):
+        yield Finding("one_of_two", **words)
     if words := unresolved_words(run):
         yield Finding("unresolved", **words)
 

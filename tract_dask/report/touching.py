@@ -7,12 +7,9 @@ from typing import Any
 import numpy as np
 
 from ..kernels.gaussian.joint import MOST_MEMBERS
-from ..stages.groups import groups_of, touching
+from ..stages.groups import UNRESOLVED, groups_of, touching
 from .finding import count, named
 from .survey import Survey
-
-BLIND = 0.25
-"""Share of a pair's distance that the stated error of a position may have."""
 
 
 def alone_words(run: Survey) -> dict[str, Any] | None:
@@ -39,24 +36,59 @@ def alone_words(run: Survey) -> dict[str, Any] | None:
     return {"title": "Touching columns were fitted each alone", "text": text, "remedy": remedy}
 
 
-def unresolved_words(run: Survey) -> dict[str, Any] | None:
-    """Return what there is to say of pairs whose distance is not much larger than its error; None where all are."""
-    columns = run.tracks["fit_ref"].to_numpy()
-    first, second, _ = touching(columns)
-    if not first.size:
+def half_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of given columns that touch one that was not given; None where there is none."""
+    ids = run.found.get("one_of_two")
+    if not ids:
         return None
+    text = (
+        f"{count(len(ids), 'given column')} ({named(ids)}) {_be(ids)} one of two that touch, as the sum shows. "
+        "The other one pulls at the position, and adds to the intensity, by more than the errors say."
+    )
+    remedy = "Leave out --columns-csv, so that both are found, or give both."
+    return {"title": "Given columns are one of two that touch", "text": text, "remedy": remedy}
+
+
+def unresolved_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of columns that one frame cannot tell apart; None where all are resolved."""
+    one, pairs = _fitted_as_one(run), _hardly_apart(run)
+    if not one and not pairs:
+        return None
+    text = ""
+    if one:
+        text += (
+            f"{count(len(one), 'column')} ({named(one)}) {_be(one)} two or more that the summed image resolves and one "
+            "frame does not: each was fitted as one, at the middle of both, and is marked "
+            "unresolved in the tracks. "
+        )
+    if pairs:
+        text += (
+            f"{count(len(pairs), 'pair')} of touching columns ({named(pairs)}) cannot be told apart in a single frame: "
+            f"the stated errors of their positions are more than {UNRESOLVED:.0%} of their distance."
+        )
+    remedy = "Sum frames (rebin_frames) to see both, or keep one column of each pair in columns.csv, for both."
+    return {"title": "Pairs of columns are not resolved in single frames", "text": text.strip(), "remedy": remedy}
+
+
+def _fitted_as_one(run: Survey) -> list[int]:
+    """Return the IDs of columns that are a fit of more than one."""
+    if "unresolved" not in run.tracks:
+        return []
+    alone = run.tracks["unresolved"].to_numpy() & (run.tracks["group"].to_numpy() == 0)
+    return [int(number) for number in run.tracks["column_id"].to_numpy()[alone]]
+
+
+def _hardly_apart(run: Survey) -> list[str]:
+    """Return the pairs whose stated errors are large beside their distance."""
+    first, second, _ = touching(run.tracks["fit_ref"].to_numpy())
     places = np.stack([run.tracks["x_ref"], run.tracks["y_ref"]], axis=-1) * run.known.scale
     distance = np.hypot(*(places[first] - places[second]).T)
     error = run.columns["expected"].to_numpy()
     with np.errstate(invalid="ignore"):
-        blind = np.maximum(error[first], error[second]) > BLIND * distance
-    if not blind.any():
-        return None
+        blind = np.maximum(error[first], error[second]) > UNRESOLVED * distance
     ids = run.tracks["column_id"].to_numpy()
-    pairs = [f"{ids[one]}-{ids[other]}" for one, other in zip(first[blind], second[blind], strict=True)]
-    text = (
-        f"{count(len(pairs), 'pair')} of touching columns ({named(pairs)}) cannot be told apart in a single frame: the "
-        f"stated errors of their positions are more than {BLIND:.0%} of their distance."
-    )
-    remedy = "Sum frames (rebin_frames), or keep one column of each pair in columns.csv, for both."
-    return {"title": "Pairs of columns are not resolved in single frames", "text": text, "remedy": remedy}
+    return [f"{ids[one]}-{ids[other]}" for one, other in zip(first[blind], second[blind], strict=True)]
+
+
+def _be(ids: list[int]) -> str:
+    return "is" if len(ids) == 1 else "are"

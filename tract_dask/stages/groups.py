@@ -15,6 +15,8 @@ JOINED = 3.2
 held where they were fitted last."""
 INSEPARABLE = 2.4
 """Nearer than this they are fitted together in any case."""
+UNRESOLVED = 0.25
+"""Error of a position in one frame, over the distance, from which columns cannot be told apart."""
 _MUCH_NEARER = 1.25
 """Ratio of the distances."""
 

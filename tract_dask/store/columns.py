@@ -24,6 +24,8 @@ _FIT_COLUMNS = tuple(name for name in parameters.PARAMETERS if name not in ("x",
 
 _FLAGS = {str(flag.name).lower(): int(flag) for flag in Status if flag}
 
+_BLIND = schema.UNRESOLVED.name
+
 MOST_BYTES = 64 << 20
 """Bytes of a table of columns."""
 
@@ -38,6 +40,7 @@ def column_dataset(
     fit: ArrayLike | None = None,
     status: ArrayLike | None = None,
     group: ArrayLike | None = None,
+    unresolved: ArrayLike | None = None,
 ) -> xr.Dataset:
     """Return a Dataset of columns as declared in :data:`schema.COLUMNS`.
 
@@ -53,6 +56,8 @@ def column_dataset(
         (columns, 7) fit on the summed image, NaN where there is none, and (columns,) its flags.
     group
         (columns,) touching columns that are fitted together; 0, which is the default: alone.
+    unresolved
+        (columns,) whether one frame cannot tell it apart from another (:data:`schema.UNRESOLVED`); by default False.
     """
     xy = np.asarray(places, dtype=np.float64).reshape(-1, 2)
     kinds = [kind] * len(xy) if isinstance(kind, str) else list(kind)
@@ -71,8 +76,9 @@ def column_dataset(
         {"column_id": ids.astype(np.int64), "parameter": list(parameters.PARAMETERS)},
     )
     dataset["status_ref"].attrs |= schema.STATUS_ATTRIBUTES
-    numbers = np.zeros(len(xy), np.int64) if group is None else np.asarray(group, np.int64)
-    dataset["group"] = schema.GROUP.dims, numbers, schema.GROUP.attributes
+    for variable, values_of in zip(schema.OF_GROUPS, (group, unresolved), strict=True):
+        own = np.full(len(xy), variable.fill) if values_of is None else np.asarray(values_of)
+        dataset[variable.name] = variable.dims, own.astype(variable.dtype), variable.attributes
     return dataset.assign_coords(unit=("parameter", list(parameters.PARAMETER_UNITS)))
 
 
@@ -120,21 +126,23 @@ def columns_csv(columns: xr.Dataset) -> str:
 
     Numbers keep their full precision; :func:`parse_columns_csv` gives back what was written.
     """
-    flags = {status: " ".join(flag_names(status)) for status in np.unique(columns["status_ref"].to_numpy()).tolist()}
+    blind = columns[_BLIND].to_numpy() if _BLIND in columns else np.zeros(columns.sizes["column_id"], np.bool_)
     fits = columns["fit_ref"].sel(parameter=list(_FIT_COLUMNS)).to_numpy()
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["column_id", "x", "y", "kind", *_FIT_COLUMNS, "flags"])
-    for column, (x, y), kind, fit, status in zip(
+    for column, (x, y), kind, fit, status, unresolved in zip(
         columns["column_id"].to_numpy().tolist(),
         positions(columns).tolist(),
         columns["kind"].to_numpy(),
         fits.tolist(),
         columns["status_ref"].to_numpy().tolist(),
+        blind.tolist(),
         strict=True,
     ):
         numbers = [repr(value) if math.isfinite(value) else "" for value in fit]
-        writer.writerow([column, repr(x), repr(y), str(kind), *numbers, flags[status]])
+        flags = [*flag_names(status), *([_BLIND] if unresolved else [])]
+        writer.writerow([column, repr(x), repr(y), str(kind), *numbers, " ".join(flags)])
     return text.getvalue()
 
 
@@ -207,7 +215,9 @@ def parse_columns_csv(text: str, where: str) -> xr.Dataset:
                 found = {name: row.number(name) for name in _FIT_COLUMNS} | {"x": place[0], "y": place[1]}
                 estimates[:] = [found[name] for name in parameters.PARAMETERS]
     kinds = [row.values.get("kind", "") for row in numbers]
-    return column_dataset(places, kinds, ids, fit, [row.flags() for row in numbers])
+    flags = [row.flags() for row in numbers]
+    blind = [_BLIND in row.values.get("flags", "").split() for row in numbers]
+    return column_dataset(places, kinds, ids, fit, flags, unresolved=blind)
 
 
 def _unreadable(where: str, error: Exception) -> SettingsError:
@@ -255,7 +265,7 @@ class _Row:
         return int(text)
 
     def flags(self) -> int:
-        found = set(self.values.get("flags", "").split())
+        found = set(self.values.get("flags", "").split()) - {_BLIND}
         if not found <= _FLAGS.keys():
             raise self._error("flags", f"some of {', '.join(_FLAGS)}")
         return sum(_FLAGS[name] for name in found)

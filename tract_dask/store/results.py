@@ -88,8 +88,7 @@ def create(
     static = columns.assign_coords(schema.coordinates(len(time)) | dict(frame_values or {}))
     static = static.assign({name: (schema.RESULTS[name].dims, values) for name, values in known.items()})
     static["kind"] = ("column_id", schema.texts(columns["kind"].to_numpy()))
-    numbers = static.get(schema.GROUP.name, xr.DataArray(np.zeros(sizes["column_id"], np.int64), dims="column_id"))
-    static[schema.GROUP.name] = schema.GROUP.dims, numbers.to_numpy(), schema.GROUP.attributes
+    static = _with_groups(static)
     for name in (*known, *schema.COLUMNS):
         static[name].attrs = (schema.RESULTS | schema.COLUMNS)[name].attributes
     static.attrs = {name: about.get(name) for name in _SCALES}
@@ -118,6 +117,16 @@ def create(
         metadata.seal(aside)
         files.remove(path)
         disk.place_folder(aside, path)
+
+
+def _with_groups(columns: xr.Dataset) -> xr.Dataset:
+    """Return columns with the variables that some have: all are alone, and resolved, where they have none."""
+    found = {}
+    for variable in schema.OF_GROUPS:
+        known = columns.get(variable.name)
+        own = np.full(columns.sizes["column_id"], variable.fill) if known is None else known.to_numpy()
+        found[variable.name] = variable.dims, own.astype(variable.dtype), variable.attributes
+    return columns.assign(found)
 
 
 def _per_file(n_shards: int, shard_bytes: int) -> int:
@@ -257,7 +266,7 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
         )
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
-    beside = [of.name for of in (schema.GROUP, schema.SHAPE_ERROR) if of.name in stored]  # earlier versions have none
+    beside = [of.name for of in (*schema.OF_GROUPS, schema.SHAPE_ERROR) if of.name in stored]  # earlier ones have none
     dataset = stored[[*schema.RESULTS, *schema.COLUMNS, *beside]].chunk(frame=frames)
     if not about.get("complete"):
         dataset = _grown(dataset, path)

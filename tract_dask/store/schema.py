@@ -206,6 +206,18 @@ SHAPE_ERROR = Variable(
 )
 """A variable that tracks have beside :data:`RESULTS`; 0 where shapes are free."""
 
+UNRESOLVED = Variable(
+    "unresolved",
+    ("column_id",),
+    "bool",
+    "1",
+    "Touching columns that one frame cannot tell apart: a fit of two or more, or of one of two that were given",
+    False,
+)
+"""Another one; without it all are resolved."""
+
+OF_GROUPS = (GROUP, UNRESOLVED)
+
 DRIFT = _declare(
     Variable("drift", ("frame", "axis"), "float64", "px", "Shift of the frame against the summed image", _NAN),
     Variable(

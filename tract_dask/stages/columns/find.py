@@ -85,10 +85,10 @@ def find_columns(
         lattice_px (shortest period of the image; None where it has none, and for columns that were given),
         blur_sigma_px, sigma_px (the columns' median sigma without that blur), rounding_variance_px2 (of the summed
         image), pixel_size_pm, n_seeds, left_out (sublattices that were seen and not taken, see
-        :class:`tract_dask.stages.columns.sublattices.LeftOut`), and merged: pairs of a column's ID and the number of a
-        later seed that refined to the same column and was dropped. (A seed's number is its ID, or its place in the list
-        of seeds, from 1: automatic ones strongest first, those of lattices lattice by lattice, without sites beyond the
-        image.)
+        :class:`tract_dask.stages.columns.sublattices.LeftOut`), one_of_two (IDs of given columns that touch one that
+        was not given), and merged: pairs of a column's ID and the number of a later seed that refined to the same
+        column and was dropped. (A seed's number is its ID, or its place in the list of seeds, from 1: automatic ones
+        strongest first, those of lattices lattice by lattice, without sites beyond the image.)
 
     Raises
     ------
@@ -113,7 +113,9 @@ def find_columns(
     groups = _numbered(best.groups[kept])
     lattice = scene.lattice() if seeds is None and settings.method in ("auto", *METHODS) else None
     kinds = found.kind[kept] if lattice is None else kinds_of(places[kept], fit[kept, AMPLITUDE], lattice)
-    columns = column_dataset(places[kept], kinds.tolist(), ids, fit[kept], fits.status[kept], groups)
+    columns = column_dataset(
+        places[kept], kinds.tolist(), ids, fit[kept], fits.status[kept], groups, best.unresolved[kept]
+    )
     name = dict(zip(kept.tolist(), ids.tolist(), strict=True))
     columns.attrs = {
         "spacing_px": best.spacing if groups.any() else neighbour_distance(places[kept]) or best.spacing,
@@ -127,6 +129,7 @@ def find_columns(
         "pixel_size_pm": summed.attrs.get("pixel_size_pm"),
         "n_seeds": len(found.number),
         "left_out": told(left_out, places[kept]),
+        "one_of_two": [int(ids[k]) for k in np.flatnonzero(best.half[kept])],
         "merged": sorted([name[first], int(found.number[twin])] for twin, first in twins.items()),
     }
     return columns
@@ -209,7 +212,8 @@ def _seeds(scene: Scene, settings: ColumnSettings, given: xr.Dataset | None) -> 
                 "Give it, or choose method auto",
             )
         given, where = read_columns_csv(settings.csv), settings.csv
-    seeds = Seeds(positions(given), schema.texts(given["kind"].to_numpy()), given["column_id"].to_numpy(), True)
+    blind = given[schema.UNRESOLVED.name].to_numpy() if schema.UNRESOLVED.name in given else None
+    seeds = Seeds(positions(given), schema.texts(given["kind"].to_numpy()), given["column_id"].to_numpy(), True, blind)
     check_inside(given, scene.valid.shape, where)
     measured = None if settings.spacing_px else neighbour_distance(seeds.places) or _lattice_of(scene, settings).spacing
     return seeds, settings.spacing_px or measured or 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,31 +12,42 @@ from ...kernels.gaussian.model import blurred
 from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
 from ...kernels.windows import blur_variance
 from ...settings.run import ColumnSettings
-from ..groups import groups_of
+from ..groups import JOINED, groups_of
+from .blobs import as_blobs, without_twins
 from .group_fits import Summed, fit_touching
 from .relief import damping
 from .scene import Scene
 from .singles import SIGNIFICANT, Fits, Seeds, fitted_alone
 from .slopes import without_slopes
-from .touching import Image, touching_columns
-from .twins import twins_of
+from .touching import touching_columns
+from .trials import Image
+from .unresolved import blind_pairs, merged
 from .window_size import neighbour_distance
 
 Floats = NDArray[np.float64]
 
 _MOVED_PX = 1e-6
-_SAME = 1.2
-"""Columns nearer than so many sigmas are the same one, found twice."""
 
 
 @dataclass(frozen=True)
 class Grouped:
-    """Columns with their groups: seeds, the distance of blobs, fits, and (n,) the group of each column; 0: alone."""
+    """Columns with their groups.
+
+    Attributes
+    ----------
+    seeds, spacing, fits
+        Where they are, the distance of blobs, px, and their fits.
+    groups, unresolved, half
+        (n,) number of each column's group, 0: alone; whether one frame cannot tell it apart from another; and whether
+        it was given without another one that it touches.
+    """
 
     seeds: Seeds
     spacing: float
     fits: Fits
     groups: NDArray[np.int64]
+    unresolved: NDArray[np.bool_]
+    half: NDArray[np.bool_]
 
 
 def grouped(
@@ -51,7 +63,8 @@ def grouped(
     """Return the columns with their groups, and with those that were missed.
 
     Touching ones are fitted together, in windows that suit their groups. Where no columns touch, their fits are as they
-    were. Given columns (``seeds.fixed``) remain the only ones.
+    were. Of those that one frame cannot tell apart one is left, a fit of both. Given columns (``seeds.fixed``) remain
+    the only ones, and all of them.
 
     Parameters
     ----------
@@ -62,43 +75,97 @@ def grouped(
     crowded
         Columns of several sublattices are nearer to each other than lattice vectors are long.
     """
-    columns = _without_twins(fits, spacing)
-    if not seeds.fixed and np.isfinite(columns).all(axis=1).any():
-        columns, more, more_fits = _with_missed(scene, seeds, spacing, fits, columns, crowded)
-    else:
-        more, more_fits = seeds, fits
+    more, own, columns = seeds, fits, without_twins(fits, spacing, seeds.places if seeds.fixed else None)
+    known = np.isfinite(columns).all(axis=1)
+    half = np.zeros(len(columns), np.bool_)
+    several = half.copy() if seeds.unresolved is None else seeds.unresolved
+    if known.any() and seeds.fixed:
+        half = _halves(scene, spacing, fits, columns, seeds.places) & ~several
+    elif known.any():
+        lattice = next(iter(scene.lattices.values()), None)
+        period = max(spacing, lattice.spacing) if lattice and not crowded else spacing
+        more, own = as_blobs(scene, settings, seeds, fits, period)
+        columns, more, own = _with_missed(scene, more, spacing, period, own, without_twins(own, spacing))
     groups = groups_of(_narrow(columns))
-    if not groups.any():
-        return Grouped(seeds, spacing, fits, np.zeros(len(seeds.places), np.int64))
-    seeds, fits = more, more_fits
-    places = fits.places.copy()
-    places[groups > 0] = columns[groups > 0][:, [X, Y]]
-    here = replace(seeds, places=places)
+    if not groups.any() and len(more.places) == len(seeds.places):
+        none = np.zeros(len(seeds.places), np.int64)
+        return Grouped(seeds, spacing, fits, none, several, half)
+    fitted = partial(_fitted, scene, settings, spacing, window_px, fits.blur_sigma_px)
+    found = fitted(more, own.places, columns, groups, several if seeds.fixed else np.zeros(len(columns), np.bool_))
+    width = found.fits.window_px
+    pairs = blind_pairs(found.fits.fit, found.groups, scene.frame_noise, width, fits.blur_sigma_px)
+    if seeds.fixed or not pairs:
+        blind = np.isin(np.arange(len(columns)), np.array(pairs, np.int64))
+        return replace(found, unresolved=blind | several, half=half) if seeds.fixed else found
+    columns, first, several = merged(found.fits.fit, pairs)
+    one = replace(more, kind=more.kind[first], number=more.number[first])
+    places = np.where(several[:, None], columns[:, [X, Y]], found.fits.places[first])
+    groups = np.where(several, 0, groups_of(_narrow(columns)))
+    return fitted(one, places, columns, groups, several)
+
+
+def _fitted(
+    scene: Scene,
+    settings: ColumnSettings,
+    spacing: float,
+    window_px: int | None,
+    blur_sigma_px: float,
+    seeds: Seeds,
+    places: Floats,
+    columns: Floats,
+    groups: NDArray[np.int64],
+    several: NDArray[np.bool_],
+) -> Grouped:
+    """Return fits of columns at places (n, 2), those of groups together; ``several``: which ones are more than one.
+
+    ``columns`` (n, 7) is where joint fits start.
+    """
+    places = np.where((groups > 0)[:, None], columns[:, [X, Y]], places)
+    here = replace(seeds, places=places, unresolved=several)
     spacing = _of_blobs(places, groups) or spacing
-    alone = fitted_alone(scene, settings, here, spacing, window_px, blur_sigma_px=fits.blur_sigma_px)
+    alone = fitted_alone(scene, settings, here, spacing, window_px, blur_sigma_px=blur_sigma_px)
     joint, status = alone.fit.copy(), alone.status.copy()
     inside = np.isfinite(alone.fit[:, X]) | (groups > 0)
     joint[groups > 0] = columns[groups > 0]
     groups = np.where(inside, groups, 0)
-    weakest = SIGNIFICANT * scene.noise * damping(fits.blur_sigma_px)
-    summed = Summed(scene.counts, scene.known, fits.blur_sigma_px, scene.sign, weakest)
-    fit_touching(summed, joint, status, groups, alone.window_px)
+    if groups.any():
+        weakest = SIGNIFICANT * scene.noise * damping(blur_sigma_px)
+        summed = Summed(scene.counts, scene.known, blur_sigma_px, scene.sign, weakest)
+        fit_touching(summed, joint, status, groups, alone.window_px)
     final = np.where(groups > 0, groups_of(np.where((groups > 0)[:, None], joint, np.nan)), 0)
     kept = final > 0
     whole_fit, flags = np.where(kept[:, None], joint, alone.fit), np.where(kept, status, alone.status)
-    return Grouped(here, spacing, replace(alone, fit=whole_fit, status=flags.astype(np.uint8)), final)
+    return Grouped(
+        here, spacing, replace(alone, fit=whole_fit, status=flags.astype(np.uint8)), final, several, several & False
+    )
+
+
+def _missed(
+    scene: Scene, spacing: float, fits: Fits, columns: Floats, radius_px: float
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return what :func:`.touching.touching_columns` does, without the blur of the fits."""
+    flat = without_slopes(scene.counts, columns, spacing)  # one side of a slope is no column
+    image = Image(flat, scene.known, scene.noise, scene.sign)
+    return touching_columns(image, blurred(columns, -blur_variance(fits.blur_sigma_px)), radius_px)
+
+
+def _halves(scene: Scene, spacing: float, fits: Fits, columns: Floats, given: Floats) -> NDArray[np.bool_]:
+    """Return which given columns (n, 7) touch one that was not given."""
+    sigma = float(np.nanmedian(columns[:, SIGMA_B]))
+    found, parent = _missed(scene, spacing, fits, columns, JOINED * sigma)
+    half = np.zeros(len(columns), np.bool_)
+    for new, own in zip(found[len(columns) :, [X, Y]], parent[len(columns) :], strict=True):
+        others = np.delete(given, own, axis=0)
+        half[own] |= not (np.hypot(*(others - new).T) < sigma).any()
+    return half
 
 
 def _with_missed(
-    scene: Scene, seeds: Seeds, spacing: float, fits: Fits, columns: Floats, crowded: bool
+    scene: Scene, seeds: Seeds, spacing: float, period: float, fits: Fits, columns: Floats
 ) -> tuple[Floats, Seeds, Fits]:
     """Return columns (n, 7), seeds and fits with the columns that were missed beside those that were found."""
     variance = blur_variance(fits.blur_sigma_px)
-    lattice = next(iter(scene.lattices.values()), None)
-    cell = max(spacing, lattice.spacing) if lattice and not crowded else spacing
-    flat = without_slopes(scene.counts, columns, spacing)  # one side of a slope is no column
-    image = Image(flat, scene.known, scene.noise, scene.sign)
-    found, parent = touching_columns(image, blurred(columns, -variance), cell / 2)
+    found, parent = _missed(scene, spacing, fits, columns, period / 2)
     n, added = len(columns), len(found) - len(columns)
     if not added:
         return columns, seeds, fits
@@ -119,21 +186,10 @@ def _narrow(columns: Floats) -> Floats:
     return narrow
 
 
-def _without_twins(fits: Fits, spacing: float) -> Floats:
-    """Return the fits without those of columns that were found twice."""
-    columns = fits.fit.copy()
-    known = np.flatnonzero(np.isfinite(columns).all(axis=1))
-    if len(known):
-        sigma = float(np.median(columns[known, SIGMA_B]))
-        twins = twins_of(columns[known][:, [X, Y]], min(_SAME * sigma, spacing / 3))
-        columns[known[list(twins)]] = np.nan
-    return columns
-
-
 def _of_blobs(places: Floats, groups: NDArray[np.int64]) -> float | None:
     """Return the median distance of blobs: groups, and columns that touch no other."""
     centres = [places[groups == number].mean(axis=0) for number in np.unique(groups[groups > 0])]
-    return neighbour_distance(np.concatenate([places[groups == 0], centres]))
+    return neighbour_distance(np.array([*places[groups == 0], *centres]))
 
 
 def same_column_px(places: Floats, groups: NDArray[np.int64], usual: float) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...kernels.filling import fill_near
 from ...kernels.magnitude import unit_of
+from ...store.camera import Camera
 from .contrast import SIGNS
 from .lattice import Lattice, find_lattice, without_holes
 from .relief import Relief, pixel_noise, relief, sample
@@ -24,7 +25,8 @@ class Scene:
     """The summed image, made ready: columns bright in ``image``; ``sign`` -1 where they are dark in ``counts``.
 
     A pixel is a number of ``unit`` counts; ``known`` tells those that some frame shows, where ``valid`` has small holes
-    and saturated tops filled. ``lattices`` are those that were looked for, by the spacing that was given.
+    and saturated tops filled. ``noise`` is a pixel's, ``frame_noise`` that in a frame without a fixed pattern.
+    ``lattices`` are those that were looked for, by the spacing that was given.
     """
 
     counts: NDArray[np.float64]
@@ -35,6 +37,7 @@ class Scene:
     noise: float
     blur_sigma_px: float | None
     unit: float
+    frame_noise: float
     lattices: dict[float | None, Lattice | None] = field(default_factory=dict)
 
     @property
@@ -77,4 +80,7 @@ def scene_of(summed: xr.Dataset, blur_sigma_px: float | None) -> Scene:
         counts = np.where(shown, counts, np.where(valid, near, np.median(sample(counts[known]))))
     unit = unit_of(counts)
     counts = counts if unit == 1 else counts / unit
-    return Scene(counts, counts, valid, known, SIGNS["bright"], pixel_noise(counts, valid), blur_sigma_px, unit)
+    noise = pixel_noise(counts, valid)
+    pattern = Camera.of(summed.attrs).fixed_pattern * float(np.median(sample(counts[known])))
+    frame_noise = np.sqrt(max(noise**2 - pattern**2, 0.0) * float(summed["exposure"].max()))
+    return Scene(counts, counts, valid, known, SIGNS["bright"], noise, blur_sigma_px, unit, float(frame_noise))

@@ -35,12 +35,24 @@ _FEWEST_FOR_SHAPE = 5
 
 @dataclass(frozen=True)
 class Seeds:
-    """Where to look: (n, 2) of (x, y), kinds, numbers to report them by; ``fixed``: the numbers stay as IDs."""
+    """Where to look: (n, 2) of (x, y), kinds, numbers to report them by; ``fixed``: the numbers stay as IDs.
+
+    ``unresolved`` tells which are known to be more than one; None: none is.
+    """
 
     places: Places
     kind: NDArray[np.str_]
     number: NDArray[np.int64]
     fixed: bool
+    unresolved: NDArray[np.bool_] | None = None
+
+    @property
+    def alike(self) -> NDArray[np.str_]:
+        """Columns with the same one are of about the same shape."""
+        if self.unresolved is None:
+            return self.kind
+        parts = zip(self.kind, self.unresolved, strict=True)
+        return np.array([f"{kind} of several" if several else str(kind) for kind, several in parts])
 
 
 @dataclass(frozen=True)
@@ -92,7 +104,7 @@ def fitted_alone(
     places = np.where(inside[:, None], places, seeds.places)
     blur = default_blur(_USUAL_SIGMA * spacing) if scene.blur_sigma_px is None else float(scene.blur_sigma_px)
     blur = blur if blur_sigma_px is None else blur_sigma_px
-    fitted = partial(_fit, scene, places, corner, inside, seeds.kind, window_px, max(search, 1.0))
+    fitted = partial(_fit, scene, places, corner, inside, seeds.alike, window_px, max(search, 1.0))
     fit, status, explained = fitted(blur)
     sigma = usual_sigma(fit[status == 0], blur)
     free = scene.blur_sigma_px is None and blur_sigma_px is None

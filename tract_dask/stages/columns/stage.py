@@ -32,6 +32,7 @@ Draw = Callable[[xr.Dataset, xr.Dataset, Path], object]
 
 _KINDS = 6
 """Kinds that a summary counts."""
+_ONE_OF_TWO = "the other one pulls at them; leave out --columns-csv, or give both"
 
 _OUR_TABLE = b"column_id,x,y,kind,"
 """How a table begins that a run has written."""
@@ -96,8 +97,15 @@ def columns_stage(
         files.write_aside(csv, table)
     figure.unlink(missing_ok=True)  # it is of other columns
     draw(summed, found.copy(), figure)
-    on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(found)))
+    _tell(found, began, on_event)
     return found
+
+
+def _tell(columns: xr.Dataset, began: float, on_event: Sink) -> None:
+    """Tell what was found, and warn of given columns that touch one that was not given."""
+    if half := columns.attrs.get("one_of_two"):
+        on_event(Warned(f"{len(half)} of the given columns are one of two that touch: {_ONE_OF_TWO}"))
+    on_event(StageDone("columns", perf_counter() - began, summary=_columns_summary(columns)))
 
 
 def check_edited(
@@ -245,11 +253,13 @@ def _columns_summary(columns: xr.Dataset) -> str:
     merged = len(columns.attrs.get("merged", ()))
     kinds = Counter(kind for kind in columns["kind"].to_numpy().astype(str).tolist() if kind)
     of_kinds = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
+    unresolved = int(columns["unresolved"].sum())
     parts = (
         f"{columns.sizes['column_id']} columns" + f" ({of_kinds})" * (0 < len(kinds) <= _KINDS),
         f"{columns.attrs['contrast']}, as the image says" if "contrast_rival" in columns.attrs else "",
         f"{outside} outside the frame" if outside else "",
         f"{merged} seeds merged" if merged else "",
+        f"{unresolved} not resolved in single frames" if unresolved else "",
     )
     return ", ".join(filter(None, parts))
 

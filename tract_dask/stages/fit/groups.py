@@ -73,6 +73,7 @@ def plan_groups(
     window_px: int,
     settings: FitSettings,
     correlation: Floats | None = None,
+    frame: tuple[int, ...] | None = None,
 ) -> tuple[Groups, ...]:
     """Return the groups, by size.
 
@@ -86,6 +87,8 @@ def plan_groups(
         Diameter of a column's own window.
     correlation
         (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; None: they share none.
+    frame
+        (y, x) pixels of a frame, which windows are no larger than; None: any size.
     """
     if not numbers.any():
         return ()
@@ -101,6 +104,10 @@ def plan_groups(
         centre = (places.min(axis=0) + places.max(axis=0)) / 2
         reach = np.abs(np.rint(places - centre)).max(axis=0).astype(int) + window_px // 2
         rows, across = (2 * -(-int(side) // _STEP) * _STEP + 1 for side in reach)
+        if frame is not None:
+            rows, across = (
+                min(side, whole - (whole + 1) % 2) for side, whole in zip((rows, across), frame, strict=True)
+            )
         outer = sorted(set[int]().union(*(near.get(int(k), set()) for k in members)) - set(members.tolist()))
         classes.setdefault((len(members), (rows, across)), []).append((members, centre, outer))
     return tuple(
@@ -237,8 +244,6 @@ def _exact(
     flat = np.concatenate([own[:3] for own in slopes] + [slopes[0][3:4]])
     scale = np.sqrt((flat**2).sum(axis=1))
     images = np.zeros((len(flat), *mask.shape))
-    unseen = scale == 0  # places of a column without a height
-    scale[unseen] = 1
     images[:, mask] = flat / scale[:, None]
     inverse = np.linalg.pinv(images[:, mask] @ images[:, mask].T)
     reach = kernel.size // 2
@@ -257,7 +262,7 @@ def _exact(
     covariance = inverse @ meat @ inverse / np.outer(scale, scale)
     trace = whole if correlation is None else whole * _share(kernel, correlation)
     found = np.full((len(group), 7), np.nan)
-    variances = np.where(unseen, np.nan, covariance.diagonal())
+    variances = covariance.diagonal()
     found[:, [X, Y, AMPLITUDE]] = np.sqrt(variances[:-1]).reshape(-1, 3)
     found[:, BACKGROUND] = np.sqrt(variances[-1])
     return found, (trace - float(np.trace(inverse @ meat))) / whole

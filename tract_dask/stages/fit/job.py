@@ -82,6 +82,8 @@ class Job:
     """Counts at which pixels are cut off; None where they are not."""
     summed: Floats | None = None
     """(columns,) frames that show the column in the summed image; None where it is not known."""
+    frame: tuple[int, ...] | None = None
+    """(y, x) pixels of a frame; None where it is large enough for any window."""
 
     def save(self, path: Path, movie: Movie, key: str) -> None:
         """Create the store of results at ``path``, from which :meth:`load` makes the same job."""
@@ -115,7 +117,8 @@ class Job:
     @lru_cache(maxsize=4)
     def load(cls, path: Path, movie: Movie, key: str) -> Job:
         """Return the job that :meth:`save` has written to ``path``; ``key`` tells one fit stage from the next."""
-        columns = datasets.open_dataset(path, only=(*schema.COLUMNS, schema.GROUP.name, "drift_measured"))
+        of_groups = [variable.name for variable in schema.OF_GROUPS]
+        columns = datasets.open_dataset(path, only=(*schema.COLUMNS, *of_groups, "drift_measured"))
         about = metadata.attributes(path)
         if about.get("key") != key:
             raise left_over(path, f"key {key}", f"key {about.get('key')}")
@@ -137,6 +140,7 @@ class Job:
             lost=tuple(about["lost"]),
             unusable=about["vacuum_unusable"],
             full_scale=_full_scale(movie),
+            frame=movie.shape[1:],
         )
 
     @cached_property
@@ -259,7 +263,7 @@ class Job:
     def groups(self) -> tuple[Groups, ...]:
         """Touching columns, which are fitted together; none with maximum likelihood."""
         shared = None if self.correlation is None else np.array(self.correlation)
-        return plan_groups(self.group_numbers, self.reference, self.window_px, self.settings, shared)
+        return plan_groups(self.group_numbers, self.reference, self.window_px, self.settings, shared, self.frame)
 
     @cached_property
     def shape_error(self) -> xr.Variable:
@@ -321,6 +325,7 @@ def prepare(
         correlation=camera.correlation if camera.shared.size > 1 else None,
         full_scale=_full_scale(movie),
         summed=_summed_frames(movie, columns, summed, int(np.count_nonzero(~bad)) - len(_lost(drift))),
+        frame=movie.shape[1:],
     )
 
 

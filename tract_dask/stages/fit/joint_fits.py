@@ -50,10 +50,9 @@ def fit_groups(fits: FrameFits, frames: Frames, bounds: Sequence[Floats], job: J
     bounds
         Start, lower and upper bounds, (frames * columns, 7), in the same coordinates.
     """
-    usable = [groups for groups in job.groups if np.all(np.array(groups.size) <= frames.tiles.shape)]
-    for groups in usable:
+    for groups in job.groups:
         _fit_class(fits, frames, bounds, groups, bounds[0], job)
-    for groups in usable:
+    for groups in job.groups:
         if (groups.outer >= 0).any():
             _fit_class(fits, frames, bounds, groups, fits.estimates, job)
 

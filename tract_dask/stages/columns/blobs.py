@@ -1,0 +1,83 @@
+"""Blobs of touching columns: places that a method has found in one blob are one again, before it is told what it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
+from ...settings.run import ColumnSettings
+from ..groups import JOINED
+from .scene import Scene
+from .singles import Fits, Seeds, fitted_alone
+from .twins import twins_of
+
+Floats = NDArray[np.float64]
+
+_SAME = 1.2
+"""Columns nearer than so many sigmas are the same one, found twice."""
+_GIVEN_TWICE = 0.6
+"""The same of columns that were given."""
+
+
+def without_twins(fits: Fits, spacing: float, given: Floats | None = None) -> Floats:
+    """Return the fits (n, 7) without those of columns that were found twice.
+
+    ``given`` are places (n, 2) of columns that were given: those whose fits have run into one another are two, each
+    where it was given, unless they were given twice.
+    """
+    columns = fits.fit.copy()
+    known = np.flatnonzero(np.isfinite(columns).all(axis=1))
+    if not len(known):
+        return columns
+    sigma = float(np.median(columns[known, SIGMA_B]))
+    for twin, first in twins_of(columns[known][:, [X, Y]], min(_SAME * sigma, spacing / 3)).items():
+        both = known[[twin, first]]
+        if given is not None and np.hypot(*(given[both[0]] - given[both[1]])) > _GIVEN_TWICE * sigma:
+            columns[both, X : Y + 1], columns[both, SIGMA_A : SIGMA_B + 1] = given[both], sigma
+        else:
+            columns[both[0]] = np.nan
+    return columns
+
+
+def as_blobs(scene: Scene, settings: ColumnSettings, seeds: Seeds, fits: Fits, period: float) -> tuple[Seeds, Fits]:
+    """Return seeds and fits with one for those that touch, and are nearer than half the period of the blobs.
+
+    Noise makes more than one maximum of a blob, and two columns may have one; the pixels tell which it is. What cannot
+    be fitted as one, at the rim of the image, stays as it was.
+    """
+    known = np.asarray(np.isfinite(fits.fit).all(axis=1))
+    if not known.any():
+        return seeds, fits
+    number = _clusters(fits.fit, known, min(JOINED * float(np.median(fits.fit[known, SIGMA_B])), period / 2))
+    _, first, count = np.unique(number, return_index=True, return_counts=True)
+    first = first[count > 1]
+    if not len(first):
+        return seeds, fits
+    blobs = np.array([fits.fit[number == number[k]][:, [X, Y]].mean(axis=0) for k in first])
+    some = replace(seeds, places=blobs, kind=seeds.kind[first], number=seeds.number[first])
+    one = fitted_alone(scene, settings, some, period, None, blur_sigma_px=fits.blur_sigma_px)
+    whole = np.isfinite(one.fit).all(axis=1)
+    kept = np.asarray(np.isin(number, number[first[whole]], invert=True))
+    kept[first] = True
+    at = first[whole]
+    places, fit, status, explained = fits.places.copy(), fits.fit.copy(), fits.status.copy(), fits.explained.copy()
+    places[at], fit[at] = blobs[whole], one.fit[whole]
+    status[at], explained[at] = one.status[whole], one.explained[whole]
+    left = replace(seeds, places=places[kept], kind=seeds.kind[kept], number=seeds.number[kept])
+    return left, replace(fits, places=places[kept], fit=fit[kept], status=status[kept], explained=explained[kept])
+
+
+def _clusters(columns: Floats, known: NDArray[np.bool_], distance: float) -> NDArray[np.int64]:
+    """Return the number of the cluster of each column: of those that are connected by so short distances."""
+    from scipy.sparse import coo_matrix  # takes its time, and workers do not need it
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    numbers = np.flatnonzero(known)
+    near = cKDTree(columns[numbers][:, [X, Y]]).query_pairs(distance, output_type="ndarray")
+    one, other = numbers[near.astype(np.int64)].reshape(-1, 2).T
+    links = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(columns), len(columns)))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
