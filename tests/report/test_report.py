@@ -279,6 +279,14 @@ def _missing_pixels(run):
     run.values["status"][:10, 3] = Status.INCOMPLETE
 
 
+def _hopper(run):
+    run.values["status"][:3, 2] = Status.HOPPED
+
+
+def _named_twice(run):
+    run.values["status"][: N_FRAMES // 4, 2] = Status.SAME_ATOM | Status.BELOW_NOISE
+
+
 def _doubtful(run):
     run.columns["status_ref"][1:] = Status.AT_BOUND
 
@@ -299,6 +307,8 @@ def _columns_too_near(run):
         (_lost_frames, {"lost_frames"}),
         (_missing_pixels, {"incomplete"}),
         (_doubtful, {"doubtful_columns"}),
+        (_hopper, {"hopped"}),
+        (_named_twice, {"same_atom"}),
         (_columns_too_far_apart, {"spacing"}),
         (_columns_too_near, {"spacing"}),
         (_weak_column, {"weak_columns"}),

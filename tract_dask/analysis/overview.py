@@ -21,7 +21,7 @@ Flags = NDArray[np.bool_]
 QUANTITIES = ("x", "y", "intensity")
 SERIES = (*QUANTITIES, *(f"{name}_stderr" for name in QUANTITIES))
 FRAME = ("fits", "accepted", "bad", "amplitude", "drift_y", "drift_x")
-_FLAGS = ("below_noise", "not_converged", "at_bound", "shape_at_bound", "incomplete")
+_FLAGS = ("below_noise", "not_converged", "at_bound", "shape_at_bound", "incomplete", "hopped", "same_atom")
 COUNTS = ("fits", "accepted", "outside", *_FLAGS, "unlike")
 UNLIKELY = 1e-3
 """A fit is unlike one Gaussian where its p-value is below this."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..kernels.linear_motion import moved
+from .finding import count, named
 from .survey import Survey
 
 BLURRED = 0.25
@@ -15,6 +16,8 @@ SOME = 0.1
 """Share of the columns that must move by themselves, where the crystal turns as well, to be told."""
 MANY = 0.5
 """Share of the columns that must stand still for the others to be those that move."""
+SHARED = 0.1
+"""Share of a column's fits on the atom of another one that is worth a warning."""
 
 
 def slip_words(run: Survey) -> dict[str, Any] | None:
@@ -61,6 +64,34 @@ def left_out_words(run: Survey) -> dict[str, Any] | None:
         "remedy": " ".join(remedies),
         "serious": False,
     }
+
+
+def hop_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of columns that left their places and were found elsewhere; None where none did."""
+    number, ids = run.columns["hopped"].to_numpy(), run.columns["column_id"].to_numpy()
+    if not number.any():
+        return None
+    most = ids[np.argsort(-number, kind="stable")][: int((number > 0).sum())]
+    text = (
+        f"{count(int(number.sum()), 'fit')} of {count(len(most), 'column')} ({named(most.tolist())}) were found beyond "
+        "the bounds of the usual fit: these columns had left their places, and are followed there."
+    )
+    remedy = "Look at them in the movie: what is found might be another atom. fit.search_px=0 follows none."
+    return {"title": "Columns hopped", "text": text, "remedy": remedy, "serious": False}
+
+
+def same_atom_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of columns whose fits lie on the atom of another column; None where none does."""
+    number, ids = run.columns["same_atom"].to_numpy(), run.columns["column_id"].to_numpy()
+    often = number > SHARED * np.maximum(run.columns["fits"].to_numpy(), 1)
+    if not often.any():
+        return None
+    text = (
+        f"In more than {SHARED:.0%} of their fits {count(int(often.sum()), 'column')} ({named(ids[often].tolist())}) "
+        "lie on the atom of another column, which is nearer to its own place. These fits are not accepted."
+    )
+    remedy = "Is an atom named twice? Then remove one of both from columns.csv and run again."
+    return {"title": "Columns share an atom", "text": text, "remedy": remedy}
 
 
 def motion_words(run: Survey) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
 from .camera import camera_findings, faint_words, fine_columns, free_words, pattern_words
-from .crystal import left_out_words, motion_words, slip_words
+from .crystal import hop_words, left_out_words, motion_words, same_atom_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
 from .touching import alone_words, half_words, unresolved_words
@@ -399,6 +399,10 @@ def _crystal(run: Survey) -> Iterator[Finding]:
         yield Finding("crystal_motion", **words)
     if words := slip_words(run):
         yield Finding("moving_columns", **words)
+    if words := hop_words(run):
+        yield Finding("hopped", **words)
+    if words := same_atom_words(run):
+        yield Finding("same_atom", **words)
     if words := alone_words(run):
         yield Finding("touching_alone", **words)
     if words := half_words(run):
