@@ -93,13 +93,6 @@ def test_pairs_that_one_frame_does_not_resolve_are_one_column():
     assert columns.sizes["column_id"] == 2 * len(places)
 
 
-def test_given_pairs_that_one_frame_does_not_resolve_stay_two():
-    image, places = crystal(1.9, noise=0.05, frames=900, seed=7)
-    columns = find_columns(image, ColumnSettings(contrast="bright"), seeds=column_dataset(places.reshape(-1, 2)))
-    assert columns.sizes["column_id"] == 2 * len(places)
-    assert columns["unresolved"].to_numpy().all()
-
-
 def test_the_bound_of_pairs_is_that_of_their_joint_fit():
     """A pair is blind where the joint fit has errors, along the pair, of more than a quarter of the distance."""
     pair = np.array([[100.0, 14.0, 15.0, 3.0, 3.0, 0.0, 20.0], [80.0, 20.0, 15.0, 3.0, 3.0, 0.0, 20.0]])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
+from ...kernels.gaussian.parameters import SIGMA_B, X, Y
 from ...settings.run import ColumnSettings
 from ..groups import JOINED
 from .scene import Scene
@@ -18,27 +18,16 @@ Floats = NDArray[np.float64]
 
 _SAME = 1.2
 """Columns nearer than so many sigmas are the same one, found twice."""
-_GIVEN_TWICE = 0.6
-"""The same of columns that were given."""
 
 
-def without_twins(fits: Fits, spacing: float, given: Floats | None = None) -> Floats:
-    """Return the fits (n, 7) without those of columns that were found twice.
-
-    ``given`` are places (n, 2) of columns that were given: those whose fits have run into one another are two, each
-    where it was given, unless they were given twice.
-    """
+def without_twins(fits: Fits, spacing: float) -> Floats:
+    """Return the fits (n, 7) without those of columns that were found twice."""
     columns = fits.fit.copy()
     known = np.flatnonzero(np.isfinite(columns).all(axis=1))
-    if not len(known):
-        return columns
-    sigma = float(np.median(columns[known, SIGMA_B]))
-    for twin, first in twins_of(columns[known][:, [X, Y]], min(_SAME * sigma, spacing / 3)).items():
-        both = known[[twin, first]]
-        if given is not None and np.hypot(*(given[both[0]] - given[both[1]])) > _GIVEN_TWICE * sigma:
-            columns[both, X : Y + 1], columns[both, SIGMA_A : SIGMA_B + 1] = given[both], sigma
-        else:
-            columns[both[0]] = np.nan
+    if len(known):
+        sigma = float(np.median(columns[known, SIGMA_B]))
+        twins = twins_of(columns[known][:, [X, Y]], min(_SAME * sigma, spacing / 3))
+        columns[known[list(twins)]] = np.nan
     return columns
 
 

@@ -75,7 +75,7 @@ def grouped(
     crowded
         Columns of several sublattices are nearer to each other than lattice vectors are long.
     """
-    more, own, columns = seeds, fits, without_twins(fits, spacing, seeds.places if seeds.fixed else None)
+    more, own, columns = seeds, fits, without_twins(fits, spacing)
     known = np.isfinite(columns).all(axis=1)
     half = np.zeros(len(columns), np.bool_)
     several = half.copy() if seeds.unresolved is None else seeds.unresolved
