@@ -20,7 +20,7 @@ OFF = 0.1
 """A gain, or an offset as a share of the usual level above it, that is off by more than this is worth a warning."""
 PATTERN = 0.02
 """A fixed pattern with a larger standard deviation, as a share of the level, is worth a warning."""
-FAINT, FAINT_ERRORS = 0.03, 0.1
+FAINT, FAINT_ERRORS = 0.03, 0.05
 """Square of the relative error of a single frame's intensity, by which intensities are too large, from which a warning
 is worth it where it is more than :data:`OFF_BY` stated errors of a column's mean; and by which errors of places are too
 small."""
