@@ -88,7 +88,7 @@ def test_a_smaller_window_fits_columns_at_the_edge(still):
     scene = still[0]
     edge = scene.parameters[:1]
     edge[:, 2] = 155.0
-    more = column_dataset(edge[:, 1:3], ["Ce"], [99], edge).drop_vars("group")
+    more = column_dataset(edge[:, 1:3], ["Ce"], [99], edge).drop_vars(["group", "unresolved"])
     columns = xr.concat([scene.columns(), more], "column_id")
     columns.attrs = scene.columns().attrs
     assert "--window-px" in told(still, columns, window_px=19)["never_fitted"].remedy

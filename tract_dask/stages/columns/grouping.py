@@ -84,7 +84,8 @@ def grouped(
     elif known.any():
         lattice = next(iter(scene.lattices.values()), None)
         period = max(spacing, lattice.spacing) if lattice and not crowded else spacing
-        more, own = as_blobs(scene, settings, seeds, fits, period)
+        if settings.method != "lattice":  # its sites are said, and those that are merged are named
+            more, own = as_blobs(scene, settings, seeds, fits, period)
         columns, more, own = _with_missed(scene, more, spacing, period, own, without_twins(own, spacing))
     groups = groups_of(_narrow(columns))
     if not groups.any() and len(more.places) == len(seeds.places):
