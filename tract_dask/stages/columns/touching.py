@@ -56,7 +56,10 @@ def touching_columns(image: Image, columns: Floats, radius_px: float) -> tuple[F
             break
         found, parent, again, noise = _grown(image, found, parent, again, radius, noise)
     for _ in range(_ROUNDS):  # the second without what the first has found around a column
+        before = len(found)
         found, parent = agreed(image, found, parent, radius)
+        if len(found) == before:
+            break
     return found, parent
 
 
