@@ -81,7 +81,7 @@ def assert_same(made: Made, plain: Made, factor: float = 1.0) -> None:
     for one, other in zip(counted, right, strict=True):
         shown = same if one.ndim == 2 else ...
         np.testing.assert_allclose(one.to_numpy()[shown], other.to_numpy()[shown], rtol=2e-3, atol=1e-2)
-    for name in ("presence", "presence_vacuum", "r_squared"):
+    for name in ("presence", "presence_vacuum", "r_squared", "shape_error"):
         np.testing.assert_allclose(made.tracks[name], plain.tracks[name], rtol=1e-3, atol=1e-2)
 
 

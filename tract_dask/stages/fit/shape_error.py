@@ -84,6 +84,8 @@ def _error(
 ) -> Floats:
     """Return the errors (members,) of columns (members, 7) that are fitted together to the pixels of a mask."""
     margin = max(gaussian_kernel(blur).size for blur in blurs) // 2
+    columns = columns.copy()
+    columns[:, [AMPLITUDE, BACKGROUND]] /= np.abs(columns[:, AMPLITUDE]).max() or 1.0  # slopes are of about one size
     raw = blurred(columns, -blur_variance(blurs[1]))
     down, across = (np.arange(-margin, side + margin) for side in mask.shape)
     narrow = raw.copy()
