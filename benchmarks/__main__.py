@@ -23,6 +23,8 @@ SECTIONS = {
     "scheduler": scheduler.run,
 }
 DRAWN = {"kernel", "stages", "runs"}
+UNPUBLISHED = {"pairs"}
+"""Sections that the document does not show so far."""
 DOCUMENT = HERE.parent / "docs" / "performance.md"
 FIGURE = HERE.parent / "docs" / "images" / "performance.png"
 FIGURES = DOCUMENT.with_suffix(".json")

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from benchmarks import loops, report
-from benchmarks.__main__ import DOCUMENT, FIGURES, SECTIONS
+from benchmarks.__main__ import DOCUMENT, FIGURES, SECTIONS, UNPUBLISHED
 from benchmarks.fitters import LSQ, POISSON
 from benchmarks.peers.protocol import equation_1, slopes_1
 from benchmarks.sizes import SMALL
@@ -125,7 +125,7 @@ def test_every_goal_has_its_row(results):
 
 def test_the_document_shows_the_published_figures():
     published = json.loads(FIGURES.read_text(encoding="utf-8"))
-    assert published["sections"].keys() == SECTIONS.keys()
+    assert published["sections"].keys() == SECTIONS.keys() - UNPUBLISHED
     text = DOCUMENT.read_text(encoding="utf-8")
     assert f"{report.BEGIN}\n\n{report.markdown(published)}\n{report.END}" in text
 
