@@ -73,7 +73,7 @@ def of_kind(tracks: xr.Dataset, kind: str | None) -> NDArray[np.int64]:
     SettingsError
         Where no column is of it.
     """
-    kinds = tracks["kind"].to_numpy().astype(str)
+    kinds = tracks["kind"].to_numpy().astype(object).astype(str)
     some = np.flatnonzero(kinds == kind) if kind is not None else np.arange(len(kinds))
     if not len(some):
         known = ", ".join(sorted(filter(None, set(kinds)))) or "columns without a kind"

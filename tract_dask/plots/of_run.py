@@ -176,7 +176,7 @@ def _strain(run: Run, path: Path) -> Figure:
 
 
 def _polarisation(run: Run, path: Path) -> Figure:
-    known = set(run.tracks["kind"].to_numpy().astype(str))
+    known = set(run.tracks["kind"].to_numpy().astype(object).astype(str))
     if not {"A", "B"} <= known:
         what, got = "columns of kinds A and B", ", ".join(sorted(filter(None, known))) or "columns of one kind"
         raise InputError("there is no off-centring to draw", "figure polarisation", what, got)

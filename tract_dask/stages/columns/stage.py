@@ -251,7 +251,7 @@ def _digest(data: bytes) -> str:
 def _columns_summary(columns: xr.Dataset) -> str:
     outside = int(((columns["status_ref"].to_numpy() & Status.OUTSIDE_FRAME) > 0).sum())
     merged = len(columns.attrs.get("merged", ()))
-    kinds = Counter(kind for kind in columns["kind"].to_numpy().astype(str).tolist() if kind)
+    kinds = Counter(kind for kind in columns["kind"].to_numpy().astype(object).astype(str).tolist() if kind)
     of_kinds = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
     unresolved = int(columns["unresolved"].sum())
     parts = (
