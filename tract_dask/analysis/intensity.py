@@ -101,7 +101,7 @@ def repeated_error(tracks: xr.Dataset) -> xr.Dataset:
     n = intensity.notnull().sum("frame")
     sd = standard_deviation(intensity)
     fitted = _root_mean_square(tracks["intensity_stderr"])
-    of_mean = (sd**2 / n.where(n > 0) + (_shape_error(tracks) * fitted) ** 2) ** 0.5
+    of_mean = (sd**2 / n.where(n > 0) + (shape_error(tracks) * fitted) ** 2) ** 0.5
     found = {
         "mean": (intensity.mean("frame"), "Mean intensity"),
         "sd": (sd, "Standard deviation of the intensity over the frames"),
@@ -274,7 +274,7 @@ def mean_intensity(tracks: xr.Dataset, frames: int | None = None) -> xr.Dataset:
             "intensity": named(mean, unit, "Mean intensity"),
             "stderr": named((variance / n.where(n > 0)) ** 0.5, unit, "Standard error of the mean"),
             "shape_stderr": named(
-                _shape_error(tracks) * variance**0.5, unit, "Error that all means of a column share, from its shape"
+                shape_error(tracks) * variance**0.5, unit, "Error that all means of a column share, from its shape"
             ),
             "chi_squared": named(scatter, "1", "Scatter against the errors: 1 for a column that does not change"),
             "n": named(n, "1", "Accepted frames"),
@@ -338,7 +338,7 @@ def intensity_against_dose(
     return table
 
 
-def _shape_error(tracks: xr.Dataset) -> Any:
+def shape_error(tracks: xr.Dataset) -> Any:
     """Return the error that all frames of a column share, over that of one frame, (column_id); 0 where none is told."""
     return tracks.get(schema.SHAPE_ERROR.name, 0.0)
 

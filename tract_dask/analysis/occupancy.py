@@ -20,8 +20,8 @@ from ..kernels.gaussian.parameters import AMPLITUDE
 from ..kernels.windows import blur_variance
 from ..settings.run import FitSettings
 from ..store.results import accepted, fitted_with, weakest
-from ..store.schema import NOT_SEEN, SHAPE_ERROR, Status
-from .intensity import UNIT, normalised
+from ..store.schema import NOT_SEEN, Status
+from .intensity import UNIT, normalised, shape_error
 from .likelihood import CONFIDENCE, Levels, credible_sets, probabilities
 from .lookup import intensity_bound, look_up_table, read_table, write_table
 from .motion import pixel_size_pm, standard_deviation
@@ -324,11 +324,10 @@ def _reference(tracks: xr.Dataset, noise_scale: float) -> xr.Dataset:
     bound = intensity_bound(sharp, window_px, fixed_shape=held)
     as_fitted = blurred(sharp, blur_variance(fitted_with(tracks, "window_blur_px")))
     intensity = np.abs(intensities(as_fitted, fitted_with(tracks, "intensity_scale"))[0])
-    shared = tracks[SHAPE_ERROR.name].to_numpy() if SHAPE_ERROR.name in tracks else np.zeros(len(fits))
     values = {
         "area": intensity / np.abs(as_fitted[:, AMPLITUDE]),
         "sigma": noise_scale * bound * intensity,
-        "shape_error": noise_scale * np.nan_to_num(shared * bound),
+        "shape_error": noise_scale * np.nan_to_num(np.asarray(shape_error(tracks)) * bound),
     }
     columns = {"column_id": tracks["column_id"]}
     return xr.Dataset({name: ("column_id", array) for name, array in values.items()}, columns)

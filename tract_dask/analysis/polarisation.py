@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..errors import InputError
-from .strain import Floats, mean_places, of_kind
+from .strain import Floats, described, mean_places, of_kind
 
 _SHELL = 1.3
 """Neighbours are as near as the nearest, up to this factor."""
@@ -74,9 +74,7 @@ def polarisation(
         {"column_id": tracks["column_id"].to_numpy()[own], "axis": ["x", "y"]},
         {"neighbours": number, "kind": kind, "around": around},
     )
-    for name in ("x_ref", "y_ref", "kind"):
-        result[name] = tracks[name].isel(column_id=own).drop_vars(["parameter", "unit"], errors="ignore")
-    return result.assign_coords(frame=tracks["frame"]) if frames == "each" else result
+    return described(result, tracks, own)
 
 
 def neighbour_distances(tracks: xr.Dataset, first: str | None = None, second: str | None = None) -> xr.Dataset:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..errors import InputError, SettingsError
+from ..store.schema import texts
 from .motion import positions, standard_errors
 
 Floats = NDArray[np.float64]
@@ -73,12 +74,19 @@ def of_kind(tracks: xr.Dataset, kind: str | None) -> NDArray[np.int64]:
     SettingsError
         Where no column is of it.
     """
-    kinds = tracks["kind"].to_numpy().astype(object).astype(str)
+    kinds = texts(tracks["kind"].to_numpy())
     some = np.flatnonzero(kinds == kind) if kind is not None else np.arange(len(kinds))
     if not len(some):
         known = ", ".join(sorted(filter(None, set(kinds)))) or "columns without a kind"
         raise SettingsError("no column is of this kind", "kind", known, str(kind))
     return some
+
+
+def described(found: xr.Dataset, tracks: xr.Dataset, some: NDArray[np.int64]) -> xr.Dataset:
+    """Return what was found of some columns with their places and kinds; of frames, with their numbers."""
+    for name in ("x_ref", "y_ref", "kind"):
+        found[name] = tracks[name].isel(column_id=some).drop_vars(["parameter", "unit"], errors="ignore")
+    return found.assign_coords(frame=tracks["frame"]) if "frame" in found.dims else found
 
 
 def strain(
@@ -139,11 +147,7 @@ def strain(
     }
     variables |= {f"{name}_stderr": (dims, errors[..., k]) for k, name in enumerate(COMPONENTS)}
     result = xr.Dataset(variables, {"column_id": ids}).assign(neighbours=(dims, number))
-    for name in ("x_ref", "y_ref", "kind"):
-        result[name] = tracks[name].isel(column_id=some).drop_vars(["parameter", "unit"], errors="ignore")
-    if frames == "each":
-        result = result.assign_coords(frame=tracks["frame"])
-    return result.assign_attrs(a_pm=basis[0].tolist(), b_pm=basis[1].tolist())
+    return described(result, tracks, some).assign_attrs(a_pm=basis[0].tolist(), b_pm=basis[1].tolist())
 
 
 def lattice_of(at: Floats, chosen: NDArray[np.bool_] | None = None) -> Floats:

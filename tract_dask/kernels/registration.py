@@ -306,9 +306,9 @@ def search_rival(
     first = np.unravel_index(int(np.argmin(np.where(good, step, np.inf))), score.shape)
     from_first = away(lag[first[0]] + centre[0], lag[first[1]] + centre[1])
     best = _top(np.where(wanted & (from_first < apart[1] / 2), score, -np.inf), score)
-    others = good & (away(best[0] + centre[0] - reach, best[1] + centre[1] - reach) >= apart[1])
-    near = _top(np.where(distance < 2, score, -np.inf), score)
     y, x = best[0] + centre[0] - reach, best[1] + centre[1] - reach
+    others = good & (away(y, x) >= apart[1])
+    near = _top(np.where(distance < 2, score, -np.inf), score)
     length = float(np.hypot(y - guess[0], x - guess[1]))
     return Rival(y, x, best[2], near[2], length, float(np.min(np.where(others, step, np.inf))))
 

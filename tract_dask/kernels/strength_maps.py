@@ -64,7 +64,7 @@ def strength_maps(
     >>> filters = np.zeros((1, 3, 3), np.float32)
     >>> filters[0, 1, 1] = 1
     >>> strength_maps(image, filters, np.zeros(1, np.int64), 2)[0].tolist()
-    [[0.0, 0.0], [0.0, 0.0]]
+    [[0.0, 0.0], [2.0, 0.0]]
     >>> strength_maps(image, filters, np.zeros(1, np.int64), 1)[0, 2].tolist()
     [2.0, 0.0, 0.0]
     """

@@ -82,6 +82,13 @@ def blur_variance(sigma: float) -> float:
     return float(kernel @ (np.arange(kernel.size) - kernel.size // 2) ** 2.0)
 
 
+def disc(size: int) -> npt.NDArray[np.bool_]:
+    """Return which pixels of a window count, (size, size): those no farther than half its size from the middle one."""
+    offset = np.arange(size) - size // 2
+    inside: npt.NDArray[np.bool_] = np.hypot(offset[:, None], offset) <= size / 2
+    return inside
+
+
 def spreading(size: int, kernel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return the matrix (size + kernel - 1, size) that blurs what stands in a row, and loses nothing at its ends."""
     spread = np.zeros((size + kernel.size - 1, size))

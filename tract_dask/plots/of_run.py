@@ -30,7 +30,7 @@ from ..store import datasets, metadata
 from ..store.movie import Movie, open_movie
 from ..store.results import open_results
 from ..store.run_folder import RunFolder
-from ..store.schema import is_accepted
+from ..store.schema import is_accepted, texts
 
 _GROUPS = (1, 2, 4)
 """Frames in a sum, for figures against dose."""
@@ -176,7 +176,7 @@ def _strain(run: Run, path: Path) -> Figure:
 
 
 def _polarisation(run: Run, path: Path) -> Figure:
-    known = set(run.tracks["kind"].to_numpy().astype(object).astype(str))
+    known = set(texts(run.tracks["kind"].to_numpy()))
     if not {"A", "B"} <= known:
         what, got = "columns of kinds A and B", ", ".join(sorted(filter(None, known))) or "columns of one kind"
         raise InputError("there is no off-centring to draw", "figure polarisation", what, got)

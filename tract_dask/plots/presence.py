@@ -61,7 +61,7 @@ def plot_presence(
     if events is not None:
         when = edges[np.searchsorted(tracks["frame"].to_numpy()[::run], events["frame"].to_numpy(), side="right") - 1]
         rows = np.searchsorted(ids, events["column_id"].to_numpy())
-        kinds = events["kind"].to_numpy().astype(object).astype(str)
+        kinds = events["kind"].to_numpy().astype(str)
         for kind, marker in (("appears", "^"), ("vanishes", "v")):
             some = kinds == kind
             style: dict[str, Any] = {"color": LINES[1], "mec": "white", "mew": 0.6, "ms": 6, "clip_on": False}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -61,16 +62,13 @@ def plot_strain(
     if not components or not set(components) <= set(COMPONENTS):
         raise SettingsError("there is no such component", "plot_strain", ", ".join(COMPONENTS), ", ".join(components))
     values = {name: 100 * found[name].to_numpy() for name in components}
-    known = np.concatenate([np.abs(value[np.isfinite(value)]) for value in values.values()])
-    widest = scale_of(known, low=0.0)
-    norm = Normalize(-widest.norm.vmax, widest.norm.vmax)  # type: ignore[operator]
+    norm, extend = _about(0.0, *values.values())
     figure, panels = image_panels(summed, len(values))
     for letter, axes, (name, value) in zip("abcd", panels, values.items(), strict=False):
         mark_values(axes, found, value, norm, SIGNED_MAP)
         unit = "rad / 100" if name == "rotation" else "%"
         error = float(np.nanmedian(100 * found[f"{name}_stderr"])) if np.isfinite(value).any() else np.nan
         title(axes, letter if len(values) > 1 else "", f"{name}, ± {error:.2g} {unit}")
-    extend = "both" if widest.extend == "max" else "neither"
     colour_bar(panels[-1], norm, SIGNED_MAP, "Strain (%)" if "rotation" not in values else "%, rad/100", extend=extend)
     return save(figure, path)
 
@@ -142,8 +140,7 @@ def plot_neighbour_distances(found: xr.Dataset, summed: xr.Dataset, path: str | 
     middle = np.stack([found["x"], found["y"]])
     figure, (axes,) = image_panels(summed)
     middles = np.median(distance) if len(distance) else 0.0
-    reach = scale_of(np.abs(distance - middles), low=0.0)
-    norm = Normalize(middles - float(reach.norm.vmax or 1), middles + float(reach.norm.vmax or 1))
+    norm, extend = _about(float(middles), distance)
     lines = LineCollection(np.stack([(middle - half).T, (middle + half).T], axis=1).tolist(), cmap=SIZE_MAP, norm=norm)
     lines.set_array(distance)
     lines.set_linewidth(min(3.0, PAGE_INCHES / 3))
@@ -152,6 +149,13 @@ def plot_neighbour_distances(found: xr.Dataset, summed: xr.Dataset, path: str | 
     error = float(np.median(found["distance_stderr"])) if len(distance) else np.nan
     spread = float(distance.std()) if len(distance) else np.nan
     title(axes, "", f"{len(distance):,} pairs, {middles:.1f} pm, sd {spread:.2g}, ± {error:.2g} each")
-    extend = "both" if reach.extend == "max" else "neither"
     colour_bar(axes, norm, SIZE_MAP, "Distance (pm)", extend=extend)
     return save(figure, path)
+
+
+def _about(middle: float, *values: np.ndarray[Any, Any]) -> tuple[Normalize, str]:
+    """Return a scale of colours that reaches as far below a middle as above it, and which of its ends go on."""
+    away = np.concatenate([np.abs(value[np.isfinite(value)] - middle) for value in values])
+    reach = scale_of(away, low=0.0)
+    most = float(reach.norm.vmax or 1)
+    return Normalize(middle - most, middle + most), "both" if reach.extend == "max" else "neither"

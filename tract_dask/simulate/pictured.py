@@ -179,6 +179,6 @@ def _still_columns(
         "x": columns["x_ref"].to_numpy() + drift[:, 1:],
         "y": columns["y_ref"].to_numpy() + drift[:, :1],
         "atoms": np.repeat(atoms[None], len(drift), axis=0),
-        "kind": columns["kind"].to_numpy().astype(object).astype(str),
+        "kind": columns["kind"].to_numpy().astype(str),
         "role": np.full(atoms.size, "static", dtype="<U7"),
     }

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from .parameters import BACKGROUND
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -106,3 +108,13 @@ def model_slopes(column: Floats, x: Floats, y: Floats, *, fixed_shape: bool) -> 
         share = amplitude * area * (sigma_a * sigma_b) ** 2  # area = 2 pi / sqrt(a c - b^2)
         by_volume += [-0.5 * share * c, share * b, -0.5 * share * a]
     return gaussian + background, np.array(slopes), np.array(by_volume)
+
+
+def group_slopes(group: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return expected counts (n,) and slopes (3 members + 1, n) of columns (members, 7) that share a background.
+
+    Slopes are by x, y and amplitude of each, and by the background; the shapes are known.
+    """
+    found = [model_slopes(column, x, y, fixed_shape=True) for column in group]
+    slopes = np.concatenate([own[:3] for _, own, _ in found] + [found[0][1][3:4]])
+    return np.sum([counts for counts, _, _ in found], axis=0) - (len(group) - 1) * group[0, BACKGROUND], slopes

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .parameters import BACKGROUND
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -82,6 +84,13 @@ def evaluate(parameters: npt.ArrayLike, x: npt.ArrayLike, y: npt.ArrayLike) -> F
     across = (columns - x0) * np.sin(theta) + (rows - y0) * np.cos(theta)
     result: Floats = amplitude * np.exp(-0.5 * ((along / sigma_a) ** 2 + (across / sigma_b) ** 2)) + background
     return result
+
+
+def above_background(parameters: npt.ArrayLike, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
+    """Return what Gaussians add to their backgrounds at the points (x, y); otherwise as :func:`evaluate`."""
+    columns = np.array(parameters, np.float64)
+    columns[..., BACKGROUND] = 0
+    return evaluate(columns, x, y)
 
 
 def gaussian_image(parameters: npt.ArrayLike, shape: tuple[int, int]) -> Floats:

@@ -7,6 +7,7 @@ one column of the usual shape does not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,14 +39,25 @@ class _Usual(NamedTuple):
     shape: Floats
 
 
-def agreed(image: Image, columns: Floats, parent: NDArray[np.int64], radius: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Return columns and parents, with second columns where most of the blobs have one at the same vector."""
+def agreed(
+    image: Image, columns: Floats, parent: NDArray[np.int64], radius: int, known: Sequence[tuple[Trial, Tried]] = ()
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return columns and parents, with second columns where most of the blobs have one at the same vector.
+
+    ``known``: what one more column makes of some of the columns, as they are.
+    """
     numbers = near(columns, radius)
     size = np.where(numbers > 0, np.bincount(numbers)[numbers], 1)
     single = np.isfinite(columns).all(axis=1) & (size == 1)
     pairs = [columns[numbers == number] for number in np.unique(numbers[size == 2])]
-    trials = [trial for trial in trials_of(image, columns, single, radius) if trial.members.shape[1] == 1]
-    tried = [with_one_more(trial, columns, radius, image.sign) for trial in trials]
+    alone = [(trial, one) for trial, one in known if trial.members.shape[1] == 1]
+    for trial, _ in alone:
+        single[trial.members] = False
+    alone += [
+        (trial, with_one_more(trial, columns, radius, image.sign))
+        for trial in trials_of(image, columns, single, radius)
+    ]
+    trials, tried = [trial for trial, _ in alone], [one for _, one in alone]
     noise = noise_of(trials, tried, image.noise)
     usual = _usual(pairs, trials, tried, noise)
     if usual is None:

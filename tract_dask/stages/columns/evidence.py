@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.gaussian.model import evaluate
+from ...kernels.gaussian.model import above_background
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ..groups import TOUCHING
 from .trials import Floats, Mask, Trial, Tried
@@ -47,9 +47,7 @@ def noise_of(trials: list[Trial], tried: list[Tried], least: float, known: Noise
         left += (one.after / np.maximum(number - 4 * one.fits.shape[1], 1)).tolist()
         across, down = (np.arange(side) for side in trial.windows.shape[:0:-1])
         for window, mask, group in zip(trial.windows, trial.masks, one.fits, strict=True):
-            shapes = group.copy()
-            shapes[:, BACKGROUND] = 0
-            columns = evaluate(shapes, across, down[:, None]).sum(axis=0) * mask
+            columns = above_background(group, across, down[:, None]).sum(axis=0) * mask
             residual = np.where(mask, window - columns - group[0, BACKGROUND], 0)
             power = float((residual**2).sum())
             seen = float((columns**2 * residual**2).sum() / max(float((columns**2).sum()), 1e-300))
@@ -99,7 +97,8 @@ def explains(trial: Trial, tried: Tried, noise: Noise) -> Mask:
 
 def is_like_columns(fits: Floats) -> Mask:
     """Return in which groups (n, members, 7) distances and amplitudes are those of columns that touch."""
-    amplitude = np.abs(fits[..., AMPLITUDE]) / np.abs(fits[..., AMPLITUDE]).max(axis=1, keepdims=True)
+    amplitude = np.abs(fits[..., AMPLITUDE])
+    amplitude /= np.maximum(amplitude.max(axis=1, keepdims=True), np.finfo(float).tiny)
     away = fits[:, :, None, [X, Y]] - fits[:, None, :, [X, Y]]
     distance = np.hypot(away[..., 0], away[..., 1])
     distance[:, np.arange(fits.shape[1]), np.arange(fits.shape[1])] = np.inf

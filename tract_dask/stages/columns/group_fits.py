@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.joint_shapes import ShapeFits, fit_shapes
-from ...kernels.gaussian.model import evaluate
-from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from ...kernels.gaussian.model import above_background
+from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, X, Y
 from ...kernels.windows import cut_windows
 from ...store.schema import Status
 
@@ -87,9 +87,8 @@ def rendered(columns: Floats, shape: tuple[int, ...]) -> Floats:
         rows = np.arange(max(y - reach, 0), min(y + reach + 1, shape[0]))
         across = np.arange(max(x - reach, 0), min(x + reach + 1, shape[1]))
         if len(rows) and len(across):
-            own = column.copy()
-            own[BACKGROUND] = 0
-            image[rows[0] : rows[-1] + 1, across[0] : across[-1] + 1] += evaluate(own, across, rows[:, None])
+            own = above_background(column, across, rows[:, None])
+            image[rows[0] : rows[-1] + 1, across[0] : across[-1] + 1] += own
     return image
 
 
@@ -116,9 +115,7 @@ def _fit_class(
     start[..., [X, Y]] -= corner[:, None]
     masks = np.zeros(windows.shape, np.bool_)
     for k, ((left, top), own) in enumerate(zip(corner, start, strict=True)):
-        alone = own.copy()
-        alone[:, BACKGROUND] = 0
-        windows[k] += evaluate(alone, x, y).sum(axis=0)
+        windows[k] += above_background(own, x, y).sum(axis=0)
         disc = [np.hypot(x - px, y - py) <= window_px / 2 for px, py in np.rint(own[:, [X, Y]])]
         masks[k] = np.any(disc, axis=0) & image.known[top : top + rows, left : left + across]
     fits = _best(windows, masks, start, image.sign)

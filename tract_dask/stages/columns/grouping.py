@@ -95,9 +95,11 @@ def grouped(
     found = fitted(more, own.places, columns, groups, several if seeds.fixed else np.zeros(len(columns), np.bool_))
     width = found.fits.window_px
     pairs = blind_pairs(found.fits.fit, found.groups, scene.frame_noise, width, fits.blur_sigma_px)
-    if seeds.fixed or not pairs:
+    if seeds.fixed:
         blind = np.isin(np.arange(len(columns)), np.array(pairs, np.int64))
-        return replace(found, unresolved=blind | several, half=half) if seeds.fixed else found
+        return replace(found, unresolved=blind | several, half=half)
+    if not pairs:
+        return found
     columns, first, several = merged(found.fits.fit, pairs)
     one = replace(more, kind=more.kind[first], number=more.number[first])
     places = np.where(several[:, None], columns[:, [X, Y]], found.fits.places[first])
@@ -174,9 +176,8 @@ def _with_missed(
     whole = np.concatenate(
         [np.where(changed[:, None], blurred(found[:n], variance), columns), blurred(found[n:], variance)]
     )
-    number = np.concatenate([seeds.number, seeds.number.max(initial=0) + 1 + np.arange(added)])
     places = np.concatenate([fits.places, whole[n:, [X, Y]]])
-    more = replace(seeds, places=places, kind=seeds.kind[parent], number=number)
+    more = replace(seeds, places=places, kind=seeds.kind[parent], number=seeds.numbers_with(added))
     return whole, more, replace(fits, places=places)
 
 

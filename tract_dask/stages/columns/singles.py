@@ -46,6 +46,10 @@ class Seeds:
     fixed: bool
     unresolved: NDArray[np.bool_] | None = None
 
+    def numbers_with(self, more: int) -> NDArray[np.int64]:
+        """Return the numbers, and those of so many that are added."""
+        return np.concatenate([self.number, self.number.max(initial=0) + 1 + np.arange(more)])
+
     @property
     def alike(self) -> NDArray[np.str_]:
         """Columns with the same one are of about the same shape."""

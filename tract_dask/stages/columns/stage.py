@@ -23,7 +23,7 @@ from ...store import datasets, files, metadata
 from ...store.columns import check_inside, columns_csv, read_columns_csv
 from ...store.held import check_held
 from ...store.keys import counted, stage_key
-from ...store.schema import Status
+from ...store.schema import Status, texts
 from ...store.strangers import MOVIE_KEY
 from ..keep import content, save
 
@@ -251,7 +251,7 @@ def _digest(data: bytes) -> str:
 def _columns_summary(columns: xr.Dataset) -> str:
     outside = int(((columns["status_ref"].to_numpy() & Status.OUTSIDE_FRAME) > 0).sum())
     merged = len(columns.attrs.get("merged", ()))
-    kinds = Counter(kind for kind in columns["kind"].to_numpy().astype(object).astype(str).tolist() if kind)
+    kinds = Counter(kind for kind in texts(columns["kind"].to_numpy()).tolist() if kind)
     of_kinds = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
     unresolved = int(columns["unresolved"].sum())
     parts = (

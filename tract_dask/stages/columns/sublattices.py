@@ -195,9 +195,8 @@ def _ordered(group: Places, start: Places, lattice: Lattice, known: Places, tree
 def _seeds(seeds: Seeds, more: list[Sublattice]) -> Seeds:
     places = np.concatenate([seeds.places, *(one.places for one in more)])
     added = len(places) - len(seeds.places)
-    number = np.concatenate([seeds.number, seeds.number.max(initial=0) + 1 + np.arange(added)])
     kind = np.concatenate([seeds.kind, np.full(added, "")])
-    return replace(seeds, places=places, kind=kind, number=number)
+    return replace(seeds, places=places, kind=kind, number=seeds.numbers_with(added))
 
 
 def _parts(first: int, more: list[Sublattice]) -> list[slice]:

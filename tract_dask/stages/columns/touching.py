@@ -17,7 +17,7 @@ from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, X, Y
 from .agreed import agreed
 from .evidence import Noise, called_for, noise_of
 from .relief import binned
-from .trials import Floats, Image, Mask, Trial, matched, near, trials_of, with_one_more
+from .trials import Floats, Image, Mask, Trial, Tried, matched, near, trials_of, with_one_more
 
 _BINS_PER_SIGMA = 2.0
 """Columns are looked for on bins of the image, so many to a sigma."""
@@ -50,16 +50,17 @@ def touching_columns(image: Image, columns: Floats, radius_px: float) -> tuple[F
         return _scaled(found, step), parent
     found, parent = columns.copy(), np.arange(len(columns))
     radius = int(max(radius_px, 3))
-    again, noise = _suspects(image, columns, radius), None
+    again, noise, known = _suspects(image, columns, radius), None, list[tuple[Trial, Tried]]()
     for _ in range(MOST_MEMBERS - 1):
         if not again.any():
             break
-        found, parent, again, noise = _grown(image, found, parent, again, radius, noise)
+        found, parent, again, noise, known = _grown(image, found, parent, again, radius, noise)
     for _ in range(_ROUNDS):  # the second without what the first has found around a column
         before = len(found)
-        found, parent = agreed(image, found, parent, radius)
+        found, parent = agreed(image, found, parent, radius, known)
         if len(found) == before:
             break
+        known = []
     return found, parent
 
 
@@ -101,8 +102,11 @@ def _suspects(image: Image, columns: Floats, radius: int) -> Mask:
 
 def _grown(
     image: Image, columns: Floats, parent: NDArray[np.int64], chosen: Mask, radius: int, known: Noise | None
-) -> tuple[Floats, NDArray[np.int64], Mask, Noise]:
-    """Return columns, parents, which of them have changed after one more is tried in each group, and the noise."""
+) -> tuple[Floats, NDArray[np.int64], Mask, Noise, list[tuple[Trial, Tried]]]:
+    """Return columns, parents, which have changed after one more is tried in each group, the noise, and what was tried.
+
+    Where columns have changed, nothing of that holds any longer.
+    """
     found, again = columns.copy(), np.zeros(len(columns), np.bool_)
     added, parents = [], []
     trials = trials_of(image, columns, chosen, radius)
@@ -113,18 +117,19 @@ def _grown(
     for trial, one, more in zip(trials, tried, kept, strict=True):
         if trial.members.shape[1] not in common:
             continue
-        one.fits[..., [X, Y]] += trial.corner[:, None]
-        for group, members in zip(one.fits[more], trial.members[more], strict=True):
+        fits = one.fits.copy()
+        fits[..., [X, Y]] += trial.corner[:, None]
+        for group, members in zip(fits[more], trial.members[more], strict=True):
             order = matched(group, columns[members])
             found[members], again[members] = group[order[:-1]], True
             added.append(group[order[-1]])
             nearest = int(np.hypot(*(group[order[:-1]] - group[order[-1]])[:, [X, Y]].T).argmin())
             parents.append(int(parent[members[nearest]]))
     if not added:
-        return columns, parent, again, noise
+        return columns, parent, again, noise, list(zip(trials, tried, strict=True))
     found = np.concatenate([found, added])
     parent = np.concatenate([parent, parents])
-    return found, parent, np.concatenate([again, np.ones(len(added), np.bool_)]), noise
+    return found, parent, np.concatenate([again, np.ones(len(added), np.bool_)]), noise, []
 
 
 def _common(trials: list[Trial], kept: list[Mask], numbers: NDArray[np.int64]) -> set[int]:

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from ...kernels.gaussian.joint import MOST_MEMBERS
 from ...kernels.gaussian.joint_shapes import fit_shapes
-from ...kernels.gaussian.model import evaluate
+from ...kernels.gaussian.model import above_background
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ..groups import INSEPARABLE, groups_of
 from .group_fits import rendered
@@ -91,14 +91,13 @@ def trials_of(image: Image, columns: Floats, chosen: Mask, radius: int) -> list[
         for own, (x, y) in zip(columns[members], corner, strict=True):
             shapes = own.copy()
             shapes[:, [X, Y]] -= (x, y)
-            shapes[:, BACKGROUND] = 0
             rows, across = (
                 np.clip(y + along, 0, image.counts.shape[0] - 1),
                 np.clip(x + along, 0, image.counts.shape[1] - 1),
             )
             there = image.valid[np.ix_(rows, across)] & np.outer(rows == y + along, across == x + along)
             disc = np.any([np.hypot(along - c[X], along[:, None] - c[Y]) <= radius for c in shapes], axis=0)
-            around = total[np.ix_(rows, across)] - evaluate(shapes, along, along[:, None]).sum(axis=0)
+            around = total[np.ix_(rows, across)] - above_background(shapes, along, along[:, None]).sum(axis=0)
             windows.append(image.counts[np.ix_(rows, across)] - around)
             masks.append(there & disc)
         trials.append(Trial(members, corner, np.stack(windows), np.stack(masks)))
@@ -161,9 +160,7 @@ def _at_the_peak(trial: Trial, before: Floats, sign: int) -> Floats:
     along = np.arange(side)
     new = before[:, :1].copy()
     for k, (window, mask, group) in enumerate(zip(trial.windows, trial.masks, before, strict=True)):
-        shapes = group.copy()
-        shapes[:, BACKGROUND] = 0
-        model = evaluate(shapes, along, along[:, None]).sum(axis=0) + group[0, BACKGROUND]
+        model = above_background(group, along, along[:, None]).sum(axis=0) + group[0, BACKGROUND]
         sigma = max(0.7 * float(np.sqrt(group[0, SIGMA_A] * group[0, SIGMA_B])), 0.7)
         left = ndimage.gaussian_filter(np.where(mask, sign * (window - model), 0.0), sigma)
         y, x = np.unravel_index(int(np.argmax(np.where(mask, left, -np.inf))), mask.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.gaussian.information import model_slopes
+from ...kernels.gaussian.information import group_slopes
 from ...kernels.gaussian.model import blurred
 from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.windows import blur_variance
@@ -55,8 +55,7 @@ def _covariance(group: Floats, window_px: int) -> Floats:
     along = (np.arange(np.floor(first), last + 1) for first, last in zip(low, high, strict=True))
     x, y = (values.ravel() for values in np.meshgrid(*along))
     near = np.any([np.hypot(x - c[X], y - c[Y]) <= reach for c in group], axis=0)
-    slopes = [model_slopes(column, x[near], y[near], fixed_shape=True)[1] for column in group]
-    every = np.concatenate([own[:3] for own in slopes] + [slopes[0][3:4]])
+    _, every = group_slopes(group, x[near], y[near])
     scale = np.maximum(np.sqrt((every**2).sum(axis=1)), np.finfo(float).tiny)
     inverse = np.linalg.pinv((every / scale[:, None]) @ (every / scale[:, None]).T, hermitian=True)
     with np.errstate(all="ignore"):

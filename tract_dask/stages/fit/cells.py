@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...kernels.gaussian.model import evaluate
-from ...kernels.gaussian.parameters import BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from ...kernels.gaussian.model import above_background
+from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
 from ...kernels.presence import Filters, strengths
 from ...kernels.strength_maps import dense_filters
 
@@ -89,6 +89,6 @@ class Cells:
     def _expected(self, column: int) -> float:
         size = self._filters.size
         shape = self._reference[column : column + 1].copy()
-        shape[:, [X, Y]], shape[:, BACKGROUND] = size // 2, 0
-        window = evaluate(shape, np.arange(size), np.arange(size)[:, None]).astype(np.float32)
+        shape[:, [X, Y]] = size // 2
+        window = above_background(shape, np.arange(size), np.arange(size)[:, None]).astype(np.float32)
         return float(strengths(window, self._filters, np.array([column]))[0])

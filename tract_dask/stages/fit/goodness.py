@@ -18,7 +18,7 @@ from scipy.special import gammaincc
 
 from ...kernels.gaussian.information import model_slopes
 from ...kernels.gaussian.parameters import X, Y
-from ...kernels.windows import gaussian_kernel
+from ...kernels.windows import disc, gaussian_kernel
 from ...settings.run import FitSettings
 
 Floats = NDArray[np.float64]
@@ -71,11 +71,10 @@ def freedom(column: Floats, size: int, settings: FitSettings, shared: Floats | N
         (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; None: they share none.
     """
     rows, across = np.indices((size, size), dtype=np.float64)
-    disc = np.hypot(rows - size // 2, across - size // 2) <= size / 2
     at = column.copy()
     at[[X, Y]] = size // 2
     expected, slopes, _ = model_slopes(at, across.ravel(), rows.ravel(), fixed_shape=settings.shape == "fixed")
-    return freedom_left(slopes, expected, disc, settings, shared)
+    return freedom_left(slopes, expected, disc(size), settings, shared)
 
 
 def freedom_left(

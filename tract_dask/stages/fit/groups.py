@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.correlated import noise_spectrum
-from ...kernels.gaussian.information import model_slopes
+from ...kernels.gaussian.information import group_slopes
 from ...kernels.gaussian.joint import fit_joint
-from ...kernels.gaussian.model import blurred, evaluate
+from ...kernels.gaussian.model import above_background, blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.windows import blur_variance, gaussian_kernel, spreading
 from ...settings.run import FitSettings
@@ -142,9 +142,7 @@ def _class(
 def _freedom(group: Floats, mask: NDArray[np.bool_], settings: FitSettings, correlation: Floats | None) -> Freedom:
     """Return the degrees of freedom of what fits of a group (members, 7) leave in its window."""
     y, x = (values.ravel().astype(np.float64) for values in np.indices(mask.shape))
-    found = [model_slopes(column, x, y, fixed_shape=True) for column in group]
-    slopes = np.concatenate([own[:3] for _, own, _ in found] + [found[0][1][3:4]])
-    expected = np.sum([counts for counts, _, _ in found], axis=0) - (len(group) - 1) * group[0, BACKGROUND]
+    expected, slopes = group_slopes(group, x, y)
     return freedom_left(slopes, expected, mask, settings, correlation)
 
 
@@ -207,10 +205,7 @@ def _noise(
     chosen = order[np.unique(np.linspace(0, n - 1, _MODELS).round().astype(int))]
     nearest = np.abs(spread[:, None] - spread[chosen]).argmin(axis=1)
     grid = np.arange(masks.shape[2]), np.arange(masks.shape[1])[:, None]
-    shapes = own[chosen].copy()
-    background = shapes[:, :1, BACKGROUND].copy()
-    shapes[..., BACKGROUND] = 0
-    images = evaluate(shapes, *grid).sum(axis=1) + background[..., None]
+    images = above_background(own[chosen], *grid).sum(axis=1) + own[chosen][:, :1, BACKGROUND, None]
     stated = fit_joint(
         images.astype(np.float32),
         masks[chosen],
@@ -240,8 +235,7 @@ def _exact(
     """Return standard errors (members, 7) for noise of size 1, and the share of it that a fit leaves."""
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
     y, x = np.nonzero(mask)
-    slopes = [model_slopes(column, x.astype(float), y.astype(float), fixed_shape=True)[1] for column in group]
-    flat = np.concatenate([own[:3] for own in slopes] + [slopes[0][3:4]])
+    _, flat = group_slopes(group, x.astype(float), y.astype(float))
     scale = np.sqrt((flat**2).sum(axis=1))
     images = np.zeros((len(flat), *mask.shape))
     images[:, mask] = flat / scale[:, None]
@@ -249,9 +243,7 @@ def _exact(
     reach = kernel.size // 2
     down, across = (np.arange(-reach, side + reach) for side in mask.shape)
     narrow = blurred(group, -blur_variance(settings.window_blur_px))
-    background = narrow[0, BACKGROUND]
-    narrow[:, BACKGROUND] = 0
-    raw = evaluate(narrow, across, down[:, None]).sum(axis=0) + background
+    raw = above_background(narrow, across, down[:, None]).sum(axis=0) + narrow[0, BACKGROUND]
     counted = settings.counting and (raw > 0).any()
     variance = np.maximum(raw, _LEAST * raw.max()) if counted else np.ones_like(raw)
     power, spread = ([spreading(side, weights) for side in mask.shape] for weights in (kernel**2, kernel))

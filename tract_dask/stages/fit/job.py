@@ -208,6 +208,11 @@ class Job:
         """What saturated pixels of windows reach, in :attr:`unit`."""
         return None if self.full_scale is None else self.full_scale / self.unit - float(self.floor)
 
+    @property
+    def reach_px(self) -> float:
+        """How far a column may be from its place in the summed image, along x and along y, px."""
+        return min(self.settings.max_shift_px or self.window_px / 4, self.window_px / 2)
+
     @cached_property
     def filters(self) -> Filters:
         """The matched filter of each column, by which it is told whether it is there."""
@@ -221,7 +226,7 @@ class Job:
     @cached_property
     def near(self) -> Pairs:
         """Pairs of columns whose fits may end on one atom."""
-        return Pairs.of(self.reference, min(self.settings.max_shift_px or self.window_px / 4, self.window_px / 2))
+        return Pairs.of(self.reference, self.reach_px)
 
     @cached_property
     def window_noise(self) -> WindowNoise:

@@ -32,7 +32,7 @@ from .noise_size import frame_noise
 from .places import Places
 from .same_atom import on_one_atom
 from .search import search
-from .window_fits import bounds_of, fit_windows, reach_of
+from .window_fits import bounds_of, fit_windows
 
 Values = dict[str, np.ndarray[Any, Any]]
 
@@ -160,7 +160,7 @@ def _carried(common: CommonMotion, places: Places, job: Job) -> Floats | None:
     motion = np.where(certain[:, None], common.linear, 0)
     displaced = (linear_motion.moved(job.from_centre, motion) - job.from_centre)[..., ::-1]
     more = np.hypot(*np.moveaxis(displaced - places.displaced, -1, 0)).max(axis=1, initial=0)
-    return displaced if (more > reach_of(job) / 4).any() else None
+    return displaced if (more > job.reach_px / 4).any() else None
 
 
 def _noise(

@@ -21,7 +21,7 @@ from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.information import model_slopes
 from ...kernels.gaussian.model import blurred, evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
-from ...kernels.windows import blur_variance, gaussian_kernel, spreading
+from ...kernels.windows import blur_variance, disc, gaussian_kernel, spreading
 from ...settings.run import FitSettings
 from .goodness import Freedom, freedom
 
@@ -110,7 +110,7 @@ def _of_white(reference: Floats, size: int, settings: FitSettings, free: Freedom
     level = np.where(counted, counts, np.inf)
     if settings.estimator == "poisson":
         parameters = 4 if settings.shape == "fixed" else 7
-        share = 1 - parameters / np.count_nonzero(_disc(size))
+        share = 1 - parameters / np.count_nonzero(disc(size))
         ones = np.ones((len(reference), 7))
         return WindowNoise(ones, ones[:, 0], share * ones[:, 0], free, level)
     exact = [_exact(column, size, settings) for column in some]
@@ -165,32 +165,27 @@ def frame_noise(ratio: Floats, good: NDArray[np.bool_], left: Floats, free: Free
 
 def _places(size: int) -> tuple[Floats, Floats]:
     """Return x and y of the pixels that count, (n,)."""
-    y, x = np.nonzero(_disc(size))
+    y, x = np.nonzero(disc(size))
     return x.astype(np.float64), y.astype(np.float64)
-
-
-def _disc(size: int) -> NDArray[np.bool_]:
-    offset = np.arange(size) - size // 2
-    return np.hypot(offset[:, None], offset) <= size / 2
 
 
 def _exact(column: Floats, size: int, settings: FitSettings) -> tuple[Floats, float, float]:
     """Return standard errors (7,) and that of the volume for noise of size 1, and the share of it that a fit leaves."""
-    fixed, disc = settings.shape == "fixed", _disc(size)
+    fixed, inside = settings.shape == "fixed", disc(size)
     _, slopes, by_volume = model_slopes(column, *_places(size), fixed_shape=fixed)
     scale = np.sqrt((slopes**2).sum(axis=1))
     kernel = gaussian_kernel(settings.window_blur_px).astype(np.float64)
     spread, power = spreading(size, kernel), spreading(size, kernel**2)
     images = np.zeros((len(slopes), size, size))
-    images[:, disc] = slopes / scale[:, None]
-    inverse = np.linalg.inv(images[:, disc] @ images[:, disc].T)
+    images[:, inside] = slopes / scale[:, None]
+    inverse = np.linalg.inv(images[:, inside] @ images[:, inside].T)
     reach = kernel.size // 2
     along = np.arange(-reach, size + reach)
     raw = evaluate(blurred(column, -blur_variance(settings.window_blur_px)), along, along[:, None])
     variance = np.maximum(raw, 0) if settings.counting and (raw > 0).any() else np.ones_like(raw)
     wide = spread @ images @ spread.T
     meat = np.einsum("iyx,jyx,yx->ij", wide, wide, variance)
-    whole = float((power @ disc.astype(float) @ power.T * variance).sum())
+    whole = float((power @ inside.astype(float) @ power.T * variance).sum())
     covariance = inverse @ meat @ inverse / np.outer(scale, scale)
     left = 1 - float(np.trace(inverse @ meat)) / whole
     errors = np.full(7, np.nan)

@@ -22,7 +22,7 @@ from .frame_fits import FrameFits
 from .incomplete import cut_raw
 from .job import Job
 from .places import Places
-from .window_fits import bounds_of, fit_windows, reach_of
+from .window_fits import bounds_of, fit_windows
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -193,7 +193,7 @@ def _beyond(refits: FrameFits, left: Left, places: Places, job: Job) -> Bools:
     displaced = places.displaced[left.frame, left.column if places.displaced.shape[1] > 1 else 0]
     usual = job.reference[left.column][:, [Y, X]] + places.drift[left.frame] + displaced
     away = np.abs(refits.estimates[:, 0, [Y, X]] - usual).max(axis=1)
-    return np.asarray(refits.converged[:, 0] & ~refits.held[:, 0] & (away > reach_of(job)))
+    return np.asarray(refits.converged[:, 0] & ~refits.held[:, 0] & (away > job.reach_px))
 
 
 def _apart(refits: FrameFits, left: Left, fits: FrameFits, good: Bools, kept: Bools, job: Job) -> Bools:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.correlated import alike, noise_spectrum
-from ...kernels.gaussian.model import blurred, evaluate
+from ...kernels.gaussian.model import above_background, blurred
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
-from ...kernels.windows import blur_variance, gaussian_kernel, spreading
+from ...kernels.windows import blur_variance, disc, gaussian_kernel, spreading
 from ...settings.run import FitSettings
 from .groups import Groups
 
@@ -60,11 +60,9 @@ def shape_errors(
     blurs = reference_blur_px, settings.window_blur_px
     first, which = alike(reference)
     middle = window_px // 2
-    offset = np.arange(window_px) - middle
-    disc = np.hypot(offset[:, None], offset) <= window_px / 2
     some = reference[first]
     some[:, [X, Y]] = middle
-    found = np.array([_error(column[None], disc, blurs, settings, correlation)[0] for column in some])[which]
+    found = np.array([_error(column[None], disc(window_px), blurs, settings, correlation)[0] for column in some])[which]
     for of_size in groups:
         own = reference[of_size.members]
         own[..., [Y, X]] += np.array(of_size.size) // 2 - of_size.centre[:, None]
@@ -88,9 +86,7 @@ def _error(
     columns[:, [AMPLITUDE, BACKGROUND]] /= np.abs(columns[:, AMPLITUDE]).max() or 1.0  # slopes are of about one size
     raw = blurred(columns, -blur_variance(blurs[1]))
     down, across = (np.arange(-margin, side + margin) for side in mask.shape)
-    narrow = raw.copy()
-    narrow[:, BACKGROUND] = 0
-    expected = evaluate(narrow, across, down[:, None]).sum(axis=0) + raw[:, BACKGROUND].mean()
+    expected = above_background(raw, across, down[:, None]).sum(axis=0) + raw[:, BACKGROUND].mean()
     counted = (settings.counting or settings.estimator == "poisson") and expected.max() > 0
     variance = np.maximum(expected, _DARKEST * expected.max()) if counted else np.ones_like(expected)
     weights = 1 / variance[margin : margin + mask.shape[0], margin : margin + mask.shape[1]][mask]

@@ -12,6 +12,7 @@ from ...kernels.gaussian.fit import fit_gaussians
 from ...kernels.gaussian.intensity import Floats
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.presence import strengths
+from ...kernels.windows import disc
 from .frame_fits import FrameFits
 from .job import Job
 
@@ -47,7 +48,7 @@ def fit_windows(
         held |= np.minimum(value - low, high - value) < _AT_BOUND * (high - low)
     if job.vacuum is None:
         with np.errstate(invalid="ignore"):  # windows of bad frames
-            variance = windows[:, _disc(job.window_px)].var(axis=1, dtype=np.float64)
+            variance = windows[:, disc(job.window_px)].var(axis=1, dtype=np.float64)
             residual = np.sqrt((1 - fits.r_squared) * variance)
     return FrameFits(
         fits.estimates,
@@ -74,13 +75,7 @@ def _centroids(windows: NDArray[np.float32], start: Floats, which: NDArray[np.in
     sigma = np.sqrt(job.reference[:, SIGMA_A] * job.reference[:, SIGMA_B])
     best = np.full(len(sigma), job.settings.mask_radius_px) if job.settings.mask_radius_px else BEST_RADIUS * sigma
     radius, dark = np.maximum(best, SMALLEST_RADIUS_PX)[which], (job.reference[:, AMPLITUDE] < 0)[which]
-    return window_centroids(windows, start[:, [X, Y]], radius, reach_of(job), dark=dark).places[:, ::-1]
-
-
-def _disc(size: int) -> NDArray[np.bool_]:
-    """Return which pixels of a window count, (size, size): those no farther than half its size from the middle one."""
-    offset = np.arange(size) - size // 2
-    return np.hypot(offset[:, None], offset) <= size / 2
+    return window_centroids(windows, start[:, [X, Y]], radius, job.reach_px, dark=dark).places[:, ::-1]
 
 
 def bounds_of(offset: Floats, columns: NDArray[np.int64], job: Job) -> tuple[Floats, Floats, Floats]:
@@ -108,13 +103,8 @@ def bounds_of(offset: Floats, columns: NDArray[np.int64], job: Job) -> tuple[Flo
     start[...] = reference
     for k, (low, high) in bounds.items():
         lower[..., k], upper[..., k] = low, high
-    reach = reach_of(job)
+    reach = job.reach_px
     for k, shift in ((Y, offset[..., 0]), (X, offset[..., 1])):
         start[..., k] += shift
         lower[..., k], upper[..., k] = start[..., k] - reach, start[..., k] + reach
     return start, lower, upper
-
-
-def reach_of(job: Job) -> float:
-    """Return how far a column may be from its place in the summed image, along x and along y, px."""
-    return min(job.settings.max_shift_px or job.window_px / 4, job.window_px / 2)
