@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from tract_dask import convert, find_columns, fit_columns, open_movie, sum_image
 from tract_dask.kernels.gaussian.information import model_slopes
+from tract_dask.kernels.gaussian.intensity import INTENSITY_SCALE
 from tract_dask.kernels.gaussian.model import evaluate
 from tract_dask.settings import FitSettings
 from tract_dask.store.columns import positions
@@ -20,7 +21,7 @@ from .tables import Table, with_error
 
 Floats = NDArray[np.float64]
 
-PIXEL_PM, SIGMA, CELL, SIDE, FRAMES = 4.0, 3.0, 40.0, 12, 40
+PIXEL_PM, SIGMA, CELL, SIDE, FRAMES = 4.0, 3.0, 40.0, 8, 200
 """Size of a pixel; sigma of the columns and distance of the pairs, px; pairs in a row; frames of a movie."""
 PEAK, BACKGROUND, JITTER = 60.0, 20.0, 0.1
 """Counts, and by how much every column wanders, px."""
@@ -105,7 +106,7 @@ def _cells(lazy: xr.Dataset, made: Pairs, distance: float) -> list[str]:
     along = still[1::2][there] - still[::2][there]
     along /= np.hypot(*along.T)[:, None]
     longer = PIXEL_PM * np.einsum("fnk,nk->fn", error[:, 1::2] - error[:, ::2], along)
-    volume = 2 * np.pi * PEAK * SIGMA**2
+    volume = INTENSITY_SCALE[tracks.attrs["intensity_scale"]] * 2 * np.pi * PEAK * SIGMA**2
     intensity = np.where(accepted, tracks["intensity"].to_numpy()[:, chosen] - volume, np.nan)
     each = np.nanmean(longer, axis=0)
     return [

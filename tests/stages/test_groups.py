@@ -10,7 +10,6 @@ from tract_dask.kernels.gaussian.model import blurred, gaussian_image
 from tract_dask.kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from tract_dask.kernels.windows import blur_variance
 from tract_dask.settings import ColumnSettings, FitSettings
-from tract_dask.stages.fit import job as fit_job
 from tract_dask.stages.fit.groups import plan_groups
 from tract_dask.stages.groups import groups_of
 from tract_dask.store.columns import column_dataset, positions
@@ -102,9 +101,14 @@ def movie(pairs, movie_of):
 SETTINGS = FitSettings(refine_drift=False, blur_sigma_px=1.0)
 
 
+@pytest.fixture(scope="module", params=["lsq", "poisson"])
+def estimator(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def tracks(movie, pairs):
-    return fit_columns(movie, pairs.columns(), settings=SETTINGS).compute()
+def tracks(movie, pairs, estimator):
+    return fit_columns(movie, pairs.columns(), settings=replace(SETTINGS, estimator=estimator)).compute()
 
 
 def errors_of(tracks, pairs):
@@ -136,9 +140,10 @@ def test_alone_each_would_be_pulled(movie, pairs):
     assert abs(np.nanmean(outward)) > 5 * BIAS_PX
 
 
-def test_isolated_columns_are_the_same_bit_for_bit(movie, pairs, tracks):
+def test_isolated_columns_are_the_same_bit_for_bit(movie, pairs, tracks, estimator):
     """Errors and presence hold the noise of the frame, which all columns tell."""
-    single = fit_columns(movie, pairs.columns(groups=False), settings=SETTINGS).compute()
+    alone = replace(SETTINGS, estimator=estimator)
+    single = fit_columns(movie, pairs.columns(groups=False), settings=alone).compute()
     n = len(pairs.places)
     for name in ("fit", "r_squared", "n_iterations", "centroid"):
         np.testing.assert_array_equal(tracks[name].to_numpy()[:, n:], single[name].to_numpy()[:, n:], err_msg=name)
@@ -179,12 +184,6 @@ def test_groups_at_the_edge_and_missing_pixels(movie_of):
     away = known - pairs.truth
     assert np.isfinite(away[:, : len(pairs.places)]).mean() > 0.95
     assert np.nanmax(np.abs(away)) < 1
-
-
-@pytest.mark.parametrize("estimator", ["poisson"])
-def test_maximum_likelihood_fits_each_alone(movie, pairs, estimator):
-    job = fit_job.prepare(movie, pairs.columns(), None, replace(SETTINGS, estimator=estimator))
-    assert job.groups == ()
 
 
 def test_long_chains_are_cut_and_neighbours_held(movie_of):

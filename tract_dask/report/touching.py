@@ -17,22 +17,14 @@ def alone_words(run: Survey) -> dict[str, Any] | None:
     numbers = groups_of(run.tracks["fit_ref"].to_numpy())
     together = run.tracks["group"].to_numpy() if "group" in run.tracks else np.zeros_like(numbers)
     alone = (numbers > 0) & (together == 0)
-    likelihood = run.settings is not None and run.settings.fit.estimator == "poisson"
-    if likelihood:
-        alone = numbers > 0
     if not alone.any():
         return None
     ids = run.tracks["column_id"].to_numpy()[alone].tolist()
-    why = "maximum likelihood (estimator poisson) fits each column alone" if likelihood else "they were given as such"
     text = (
-        f"{count(len(ids), 'column')} touch a neighbour (column {named(ids)}), and {why}: the neighbour pulls at the "
-        "position, and adds to the intensity, by more than the errors say."
+        f"{count(len(ids), 'column')} touch a neighbour (column {named(ids)}), and they were given as such: "
+        "the neighbour pulls at the position, and adds to the intensity, by more than the errors say."
     )
-    remedy = (
-        "Run again with --estimator lsq, which fits touching columns together."
-        if likelihood
-        else f"Run again with columns that are found, not given; groups have at most {MOST_MEMBERS} columns."
-    )
+    remedy = f"Run again with columns that are found, not given; groups have at most {MOST_MEMBERS} columns."
     return {"title": "Touching columns were fitted each alone", "text": text, "remedy": remedy}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,13 @@ class Groups(NamedTuple):
     level: Floats
 
 
+def joint_settings(settings: FitSettings) -> FitSettings:
+    """Return the settings of joint fits: least squares, of counts as they are where single fits are by likelihood."""
+    if settings.estimator != "poisson":
+        return settings
+    return replace(settings, estimator="lsq", blur_sigma_px=0.0, counting=True)
+
+
 def plan_groups(
     numbers: NDArray[np.int64],
     reference: Floats,
@@ -92,6 +100,7 @@ def plan_groups(
     """
     if not numbers.any():
         return ()
+    settings = joint_settings(settings)
     near: dict[int, set[int]] = {}
     for one, other in zip(*(side.tolist() for side in touching(reference)[:2]), strict=True):
         if numbers[one] != numbers[other]:

@@ -260,13 +260,13 @@ class Job:
     def group_numbers(self) -> NDArray[np.int64]:
         """(columns,) number of the group that each column is fitted with; 0: alone."""
         given = self.columns.get(schema.GROUP.name)
-        if given is None or self.settings.estimator == "poisson":
+        if given is None:
             return np.zeros(self.columns.sizes["column_id"], np.int64)
         return given.to_numpy().astype(np.int64)
 
     @cached_property
     def groups(self) -> tuple[Groups, ...]:
-        """Touching columns, which are fitted together; none with maximum likelihood."""
+        """Touching columns, which are fitted together."""
         shared = None if self.correlation is None else np.array(self.correlation)
         return plan_groups(self.group_numbers, self.reference, self.window_px, self.settings, shared, self.frame)
 

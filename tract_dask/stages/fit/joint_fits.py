@@ -13,7 +13,7 @@ from ...kernels.gaussian.model import evaluate
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.windows import Tiles, cut_windows
 from .frame_fits import FrameFits
-from .groups import Groups, discs
+from .groups import Groups, discs, joint_settings
 from .job import Job
 from .places import group_corners, natural_corners
 
@@ -62,7 +62,7 @@ def _fit_class(
 ) -> None:
     """Replace the fits of the members of some groups; ``known`` (frames * columns, 7) are the columns around them."""
     corner = group_corners(groups, frames.drift, frames.displaced, frames.tiles.shape)
-    settings, n_columns = job.settings, frames.corner.shape[1]
+    settings, n_columns = joint_settings(job.settings), frames.corner.shape[1]
     y, x = corner[..., 0], corner[..., 1]
     windows = cut_windows(frames.tiles, y, x, groups.size, settings.window_blur_px, frames.gain, frames.first)
     windows = windows.reshape(-1, *groups.size) - job.floor

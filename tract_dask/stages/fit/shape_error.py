@@ -20,7 +20,7 @@ from ...kernels.gaussian.model import above_background, blurred
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
 from ...kernels.windows import blur_variance, disc, gaussian_kernel, spreading
 from ...settings.run import FitSettings
-from .groups import Groups
+from .groups import Groups, joint_settings
 
 Floats = NDArray[np.float64]
 
@@ -63,12 +63,13 @@ def shape_errors(
     some = reference[first]
     some[:, [X, Y]] = middle
     found = np.array([_error(column[None], disc(window_px), blurs, settings, correlation)[0] for column in some])[which]
+    together = joint_settings(settings)
     for of_size in groups:
         own = reference[of_size.members]
         own[..., [Y, X]] += np.array(of_size.size) // 2 - of_size.centre[:, None]
         chosen = np.unique(np.linspace(0, len(own) - 1, _MODELS).round().astype(int))
         found[of_size.members] = math.sqrt(
-            np.mean([_error(own[k], of_size.masks[k], blurs, settings, correlation) ** 2 for k in chosen])
+            np.mean([_error(own[k], of_size.masks[k], blurs, together, correlation) ** 2 for k in chosen])
         )
     return found
 
