@@ -73,6 +73,7 @@ def test_forked_workers_have_everything_imported_and_the_driver_keeps_its_enviro
         "tract_dask.stages.drift.measure",
         "tract_dask.stages.fit.stage",
     } <= modules
+    assert not {"scipy.ndimage", "scipy.spatial", "scipy.stats"} & modules, "these take a second, and are not needed"
 
 
 OPEN_THE_DASHBOARD = """

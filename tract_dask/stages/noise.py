@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts load on use: workers need few of them
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ..kernels.noise import Cells, Lags, Law, correlation, fit_law, gather, lag_sums
 from ..kernels.patterns import Measured, pattern_power
@@ -123,7 +123,7 @@ def _as_noise_sees(field: _Field, shared: Floats) -> Image:
     squared: for a Gaussian of variance v that is half as wide. The sum of the noise's autocorrelation is 4 pi v.
     """
     variance = float(shared.sum()) / (4 * np.pi)
-    return np.asarray(field.frames - np.float32(variance / 4) * ndimage.laplace(field.level), np.float32)
+    return np.asarray(field.frames - np.float32(variance / 4) * scipy.ndimage.laplace(field.level), np.float32)
 
 
 def _camera(cells: Cells, law: Law | None, shared: Floats | None, chance: float, offset_said: float) -> Camera:

@@ -23,6 +23,8 @@ _FEWEST, _MOST = 5, 0.5
 """Blobs that tell of the vector, and the share of them that have it."""
 _SHARE = 0.2
 """Share of all blobs that have it for sure, from which others may have it."""
+_SAMPLE = 24
+"""Blobs that are tried first: where hardly any of these tells of a vector, the others are not tried."""
 _ALIKE, _ABOUT = 0.2, 0.45
 """By how much vectors differ, over their length, where they are alike; and where a blob may have the usual one."""
 _AS_WIDE = 1.1
@@ -53,12 +55,17 @@ def agreed(
     alone = [(trial, one) for trial, one in known if trial.members.shape[1] == 1]
     for trial, _ in alone:
         single[trial.members] = False
-    alone += [
-        (trial, with_one_more(trial, columns, radius, image.sign))
-        for trial in trials_of(image, columns, single, radius)
-    ]
-    trials, tried = [trial for trial, _ in alone], [one for _, one in alone]
-    noise = noise_of(trials, tried, image.noise)
+    rest = np.flatnonzero(single)
+    some = np.isin(np.arange(len(columns)), rest[:: max(1, len(rest) // _SAMPLE)])
+    for chosen in (some, single & ~some):
+        alone += [
+            (trial, with_one_more(trial, columns, radius, image.sign))
+            for trial in trials_of(image, columns, chosen, radius)
+        ]
+        trials, tried = [trial for trial, _ in alone], [one for _, one in alone]
+        noise = noise_of(trials, tried, image.noise)
+        if chosen is some and _hopeless(pairs, trials, tried, noise, int(np.count_nonzero(single & ~some))):
+            return columns, parent
     usual = _usual(pairs, trials, tried, noise)
     if usual is None:
         return columns, parent
@@ -76,15 +83,27 @@ def agreed(
     return np.concatenate([found, added]), np.concatenate([parent, parents])
 
 
-def _usual(pairs: list[Floats], trials: list[Trial], tried: list[Tried], noise: Noise) -> _Usual | None:
-    """Return what pairs, and blobs in which a second column was tried, have in common; None where it is nothing."""
-    blobs = len(pairs) + sum(len(trial.members) for trial in trials)
-    telling = [
+def _hopeless(pairs: list[Floats], trials: list[Trial], tried: list[Tried], noise: Noise, left: int) -> bool:
+    """Return whether so few blobs tell of a vector that the ``left`` ones will not make them enough."""
+    number = sum(len(trial.members) for trial in trials)
+    told = len(_telling(trials, tried, noise))
+    most = len(pairs) + told + (told + 2 * np.sqrt(told + 1)) / max(number, 1) * left
+    return bool(most < max(_FEWEST, _SHARE * (len(pairs) + number + left)))
+
+
+def _telling(trials: list[Trial], tried: list[Tried], noise: Noise) -> list[Floats]:
+    """Return the pairs that a second column makes of the blobs that tell of a vector."""
+    return [
         pair
         for trial, own in zip(trials, tried, strict=True)
         for pair in own.fits[(fallen(trial, own, noise) > _TELLING) & is_like_columns(own.fits)]
     ]
-    both = np.array([*pairs, *telling]).reshape(-1, 2, 7)
+
+
+def _usual(pairs: list[Floats], trials: list[Trial], tried: list[Tried], noise: Noise) -> _Usual | None:
+    """Return what pairs, and blobs in which a second column was tried, have in common; None where it is nothing."""
+    blobs = len(pairs) + sum(len(trial.members) for trial in trials)
+    both = np.array([*pairs, *_telling(trials, tried, noise)]).reshape(-1, 2, 7)
     vector, alike = _most_alike(both[:, 1, [X, Y]] - both[:, 0, [X, Y]])
     if np.count_nonzero(alike) < max(_FEWEST, _MOST * len(both), _SHARE * blobs):
         return None

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import scipy  # its parts load on use: workers need few of them
 from numpy.typing import NDArray
-from scipy import fft, ndimage
-from scipy.spatial import cKDTree
 
 from ...kernels.peaks import local_maxima
 from ...kernels.windows import blur
@@ -165,9 +164,9 @@ def _correlate(image: Reals) -> Reals:
     Only one of each opposite pair of shifts is there: down by -3 px (``_MARGIN``) and more, along x the middle is zero.
     """
     down, across = (n // 2 for n in image.shape)
-    size = [fft.next_fast_len(n + n // 2 + 1, real=True) for n in image.shape]
-    spectrum = np.abs(fft.rfft2(image.astype(np.float32), s=size)) ** 2
-    whole = fft.irfft2(spectrum, s=size)
+    size = [scipy.fft.next_fast_len(n + n // 2 + 1, real=True) for n in image.shape]
+    spectrum = np.abs(scipy.fft.rfft2(image.astype(np.float32), s=size)) ** 2
+    whole = scipy.fft.irfft2(spectrum, s=size)
     rows, columns = np.arange(-_MARGIN, down + 1), np.arange(-across, across + 1)
     return np.ascontiguousarray(whole[rows][:, columns])
 
@@ -182,7 +181,7 @@ def _vertex(values: Reals, y: NDArray[np.int64], x: NDArray[np.int64], dy: int, 
 def _level(image: Reals, reach: float) -> Reals:
     """Return the median of an image's surroundings, those within ``reach`` px along each axis, from bins."""
     step = max(1, int(reach / _LEVEL_BINS))
-    bins = ndimage.median_filter(binned(image, step), 2 * round(reach / step) + 1, mode="nearest")
+    bins = scipy.ndimage.median_filter(binned(image, step), 2 * round(reach / step) + 1, mode="nearest")
     return expanded(bins, image.shape, step, ((step - 1) / 2, (step - 1) / 2))
 
 
@@ -198,7 +197,7 @@ def without_holes(there: Mask) -> Mask:
     (True, False)
     """
     side = 2 * _HOLE_PX
-    closed = ndimage.binary_closing(np.pad(there, side, mode="edge"), np.ones((_HOLE_PX, _HOLE_PX), np.bool_))
+    closed = scipy.ndimage.binary_closing(np.pad(there, side, mode="edge"), np.ones((_HOLE_PX, _HOLE_PX), np.bool_))
     whole: Mask = there | closed[side:-side, side:-side]
     return whole
 
@@ -209,7 +208,7 @@ def peaks_of(relief: Relief, spacing: float) -> tuple[Places, Reals]:
     floor = max(_SIGNIFICANT * relief.noise, 1e-9 * float(np.ptp(height)))
     peaks = local_maxima(height, max(TOLERANCE * spacing / relief.step, 1.5), floor)
     x, y = peaks.astype(np.int64).T
-    inside = ndimage.binary_erosion(relief.valid)[y, x]  # a maximum on the rim is the flank of a column outside
+    inside = scipy.ndimage.binary_erosion(relief.valid)[y, x]  # a maximum on the rim is the flank of a column outside
     strongest_first = np.argsort(-height[y, x], kind="stable")
     strongest_first = strongest_first[inside[strongest_first]]
     return relief.px(peaks[strongest_first]), height[y, x][strongest_first]
@@ -266,7 +265,7 @@ def find_peaks(relief: Relief, lattice: Lattice | None, spacing: float, min_ampl
 def start_of(peaks: Places, weights: Reals, lattice: Lattice) -> tuple[int, float]:
     """Return the peak of step 2 of :func:`find_peaks` (of few columns, one of the highest pair), and its measure."""
     sites = peaks[:, None] + lattice.translations(1)
-    distance, neighbour = cKDTree(peaks).query(sites, distance_upper_bound=TOLERANCE * lattice.spacing)
+    distance, neighbour = scipy.spatial.cKDTree(peaks).query(sites, distance_upper_bound=TOLERANCE * lattice.spacing)
     heights = np.where(np.isfinite(distance), np.append(weights, 0.0)[neighbour], 0.0)
     support = np.minimum(weights, np.median(heights, axis=1))
     pair = np.minimum(weights, heights.max(axis=1))
@@ -276,7 +275,7 @@ def start_of(peaks: Places, weights: Reals, lattice: Lattice) -> tuple[int, floa
 
 def grown(peaks: Places, weights: Reals, lattice: Lattice, start: int, weakest: float, strong: float) -> Mask:
     """Return which of the peaks, strongest first, belong to the sublattice of one: step 3 of :func:`find_peaks`."""
-    tree = cKDTree(peaks)
+    tree = scipy.spatial.cKDTree(peaks)
     taken = np.zeros(len(peaks), dtype=bool)
     blocked = weights < max(weakest, np.finfo(float).tiny)
     blocked[start] = False
@@ -298,7 +297,7 @@ def grown(peaks: Places, weights: Reals, lattice: Lattice, start: int, weakest: 
 
 def _spread(peaks: Places, taken: Mask, strong: Mask, distance: float) -> Mask:
     """Return ``taken`` and the strong peaks farther than ``distance`` from it and from those before them."""
-    tree = cKDTree(peaks)
+    tree = scipy.spatial.cKDTree(peaks)
     taken, crowded = taken.copy(), np.zeros(len(peaks), dtype=bool)
     for peak in [*np.flatnonzero(taken).tolist(), *np.flatnonzero(strong & ~taken).tolist()]:
         if taken[peak] or not crowded[peak]:
@@ -307,7 +306,7 @@ def _spread(peaks: Places, taken: Mask, strong: Mask, distance: float) -> Mask:
     return taken
 
 
-def _agreed(peak: int, peaks: Places, tree: cKDTree, taken: Mask, lattice: Lattice) -> bool:
+def _agreed(peak: int, peaks: Places, tree: scipy.spatial.cKDTree, taken: Mask, lattice: Lattice) -> bool:
     """Tell whether a peak sits on the lattice of most of the accepted peaks within two steps of it."""
     near = [other for other in tree.query_ball_point(peaks[peak], 2 * np.hypot(*lattice.b)) if taken[other]]
     if not near:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load on use: workers need few of them
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ...kernels.peaks import box_means
 from ...kernels.windows import blur
@@ -84,7 +84,7 @@ def _ridges(image: Reals, spacing: float) -> NDArray[np.float32]:
     (J. Serra, Image Analysis and Mathematical Morphology, 1982).
     """
     side = 2 * round(spacing / 2) + 1
-    surroundings = ndimage.grey_opening(image, size=(side, side))
+    surroundings = scipy.ndimage.grey_opening(image, size=(side, side))
     return np.asarray(surroundings - smooth(surroundings, spacing / 3), dtype=np.float32)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load on use: workers need few of them
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ...errors import SettingsError
 from ...kernels.gaussian.parameters import AMPLITUDE
@@ -161,7 +161,7 @@ def _is_padding(image: NDArray[np.float64], amplitude: float) -> NDArray[np.bool
     constant = np.zeros(image.shape, np.uint8)
     constant[:-1, :-1] = (image[:-1, :-1] == image[1:, :-1]) & (image[:-1, :-1] == image[:-1, 1:])
     constant[-1], constant[:, -1] = constant[-2], constant[:, -2]
-    padding: NDArray[np.bool_] = ndimage.grey_opening(constant, size=(_PADDING_PX, _PADDING_PX)).astype(bool)
+    padding: NDArray[np.bool_] = scipy.ndimage.grey_opening(constant, size=(_PADDING_PX, _PADDING_PX)).astype(bool)
     steps = [np.abs(np.diff(image, axis=axis))[np.diff(padding, axis=axis)] for axis in (0, 1)]
     edge = np.concatenate(steps)
     return padding if edge.size and np.median(edge) > _EDGE * amplitude else np.zeros_like(padding)
