@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from tract_dask.analysis.jumps import change_points
 
@@ -217,6 +218,19 @@ def samplings() -> Iterator[Trial]:
         yield Trial(f"sigma {sigma} px", scene, scene.counts(), border=8.0, tolerance=8 * sigma / 5)
 
 
+def two_grains() -> Iterator[Trial]:
+    """Two crystals side by side, turned against each other, of one or two spacings. Right: all columns of both."""
+    shape, half = (320, 360), 180.0
+    for turned, other in ((20.0, 40.0), (20.0, 34.0), (30.0, 34.0)):
+        left = lattice(shape, 40.0)
+        left = left[left[:, 0] < half]
+        right = lattice(shape, other, angle_deg=4.0 + turned)
+        right = right[(right[:, 0] >= half) & (np.asarray(cKDTree(left).query(right)[0]) > 24)]
+        places = np.concatenate([left, right]) + walk(40, 0.35, np.random.default_rng(9))[:, None]
+        scene = Scene(places, np.full(places.shape[:2], 0.45 * 6.4), 5.0, 6.4, shape)
+        yield Trial(f"two grains, turned by {turned:g} degrees, {other:g} px", scene, scene.counts())
+
+
 def high_contrast() -> Iterator[Trial]:
     """Columns four times as bright as the vacuum, and nothing but vacuum."""
     scene, _ = crystal(contrast=4.0)
@@ -248,6 +262,7 @@ SCENES: dict[str, Callable[[], Iterator[Trial]]] = {
         without_numbers,
         gain_patterns,
         samplings,
+        two_grains,
         high_contrast,
     )
 }

@@ -15,6 +15,7 @@ from ...store import schema
 from ...store.columns import check_inside, column_dataset, positions, read_columns_csv
 from .contrast import SIGNS, chosen, support
 from .detect import METHODS, make_detector
+from .grains import with_grains
 from .grouping import Grouped, grouped, same_column_px
 from .kinds import kinds_of
 from .lattice import Lattice, find_peaks
@@ -155,6 +156,8 @@ def _with_others(
     if not given and settings.method == "auto":
         more = with_fainter(scene, settings, found.seeds, found.spacing, found.fits, window_px)
     crowded = len(more.seeds.places) > len(found.seeds.places)
+    if not given and settings.method == "auto":
+        more = with_grains(scene, settings, more)
     best = grouped(scene, settings, more.seeds, more.spacing, more.fits, more.window_px, crowded=crowded)
     return best, more.left_out
 

@@ -118,7 +118,7 @@ def with_fainter(
         else:
             kept.append(one)
     while kept:
-        more = _seeds(seeds, kept)
+        more = with_places(seeds, np.concatenate([one.places for one in kept]))
         apart = neighbour_distance(more.places) or spacing
         window = window_px or _window(apart, sigma)
         again = fitted_alone(scene, settings, more, apart, window)
@@ -192,11 +192,11 @@ def _ordered(group: Places, start: Places, lattice: Lattice, known: Places, tree
     return Sublattice(own, (round(float(cell[0]), 3), round(float(cell[1]), 3)))
 
 
-def _seeds(seeds: Seeds, more: list[Sublattice]) -> Seeds:
-    places = np.concatenate([seeds.places, *(one.places for one in more)])
-    added = len(places) - len(seeds.places)
-    kind = np.concatenate([seeds.kind, np.full(added, "")])
-    return replace(seeds, places=places, kind=kind, number=seeds.numbers_with(added))
+def with_places(seeds: Seeds, more: Places) -> Seeds:
+    """Return seeds with more places (n, 2) of (x, y), px."""
+    kind = np.concatenate([seeds.kind, np.full(len(more), "")])
+    places = np.concatenate([seeds.places, more])
+    return replace(seeds, places=places, kind=kind, number=seeds.numbers_with(len(more)))
 
 
 def _parts(first: int, more: list[Sublattice]) -> list[slice]:
