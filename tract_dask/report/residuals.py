@@ -14,6 +14,7 @@ from ..kernels.gaussian.model import evaluate
 from ..kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ..kernels.windows import blur, gaussian_kernel
 from ..settings.run import FitSettings, RunSettings
+from ..stages.columns.slopes import without_slopes
 from ..stages.fit.goodness import p_values
 from ..stages.fit.noise_size import frame_noise, window_noise
 from ..store.camera import Camera
@@ -92,13 +93,15 @@ def residual_windows(tracks: xr.Dataset, summed: xr.Dataset, which: Iterable[int
     ------
     numpy.ndarray
         (3, window, window): blurred image, model, and their difference, in counts a frame, NaN beyond the disc, and
-        everywhere where the column was not fitted in the summed image. The model of touching columns is that of all in
-        the group.
+        everywhere where the column was not fitted in the summed image. A background that rises is made even. The model
+        of touching columns is that of all in the group.
     """
     window, sigma = int(tracks.attrs["window_px"]), float(tracks.attrs["reference_blur_px"])
-    image = blur(summed["image"].to_numpy(), sigma)
     parameters = tracks["fit_ref"].to_numpy().astype(np.float64)
     parameters[:, [Y, X]] += summed.attrs.get("rounding_px", (0.0, 0.0))
+    raw = summed["image"].to_numpy()
+    flat = without_slopes(raw, parameters, 2.0 * window)
+    image = blur(raw, sigma)
     half = window // 2
     rows, columns = np.mgrid[-half : half + 1, -half : half + 1]
     disc = rows**2 + columns**2 <= half**2
@@ -109,7 +112,10 @@ def residual_windows(tracks: xr.Dataset, summed: xr.Dataset, which: Iterable[int
         if min(y, x) < half or y + half >= image.shape[0] or x + half >= image.shape[1]:
             yield np.full((3, window, window), np.nan)
             continue
-        data = image[y - half : y + half + 1, x - half : x + half + 1]
+        here = (slice(y - half, y + half + 1), slice(x - half, x + half + 1))
+        data = image[here]
+        if flat is not raw:
+            data = data - (raw[here] - flat[here]) + (raw[y, x] - flat[y, x])
         model = evaluate(own, columns + x, rows + y)
         for other in np.flatnonzero((groups == groups[number]) & (groups > 0)):
             if other != number:

@@ -23,7 +23,6 @@ from .relief import Places
 from .scene import Scene, scene_of
 from .singles import Fits, Seeds, fitted_alone
 from .sites import lattice_sites
-from .slopes import drawn_by_slopes
 from .sublattices import Extended, LeftOut, told, with_fainter
 from .twins import twins_of
 from .window_size import neighbour_distance, usual_sigma
@@ -143,8 +142,6 @@ def _in_counts(best: Grouped, scene: Scene, summed: xr.Dataset, seeds: xr.Datase
     if seeds is not None and "share" in seeds:
         fit[:, AMPLITUDE] /= seeds["share"].to_numpy()
     fit[:, [Y, X]] -= summed.attrs.get("rounding_px", (0.0, 0.0))  # by which the sum of whole-pixel shifts is displaced
-    alone = (best.fits.status == 0) & (best.groups == 0)
-    fit[:, [X, Y]] -= drawn_by_slopes(np.where(alone[:, None], fit, np.nan), best.fits.window_px)
     return fit
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ...kernels.gaussian.fit import GaussianFits, fit_gaussians
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
@@ -18,6 +19,7 @@ from ...store.schema import Status
 from ..filled import fill_holes
 from .relief import Places, Relief, damping
 from .scene import Scene
+from .slopes import without_slopes
 from .window_size import default_blur, resolve_window, usual_sigma
 
 _USUAL_SIGMA = 0.13
@@ -31,6 +33,8 @@ _SHAPE_FACTOR = 1.5
 _SHAPE_MARGIN = 1.1
 """With sigmas within this factor of the median."""
 _FEWEST_FOR_SHAPE = 5
+_ROUNDS = 2
+"""So often columns are fitted again without the slopes of their background."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ def fitted_alone(
     places = np.where(inside[:, None], places, seeds.places)
     blur = default_blur(_USUAL_SIGMA * spacing) if scene.blur_sigma_px is None else float(scene.blur_sigma_px)
     blur = blur if blur_sigma_px is None else blur_sigma_px
-    fitted = partial(_fit, scene, places, corner, inside, seeds.alike, window_px, max(search, 1.0))
+    fitted = partial(_on_even_ground, scene, spacing, places, corner, inside, seeds.alike, window_px, max(search, 1.0))
     fit, status, explained = fitted(blur)
     sigma = usual_sigma(fit[status == 0], blur)
     free = scene.blur_sigma_px is None and blur_sigma_px is None
@@ -133,8 +137,30 @@ def _corners(places: Places, window_px: int, valid: NDArray[np.bool_]) -> tuple[
     return inside, corner
 
 
+def _on_even_ground(
+    scene: Scene, spacing: float, *how: Any
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
+    """Return what :func:`_fit` does, on the image less what its background rises by, where it does.
+
+    One background for a window makes of a column on a slope one that is too wide, and drawn up the slope. The
+    backgrounds of a first fit tell the slope, and those of the second tell it better.
+    """
+    found = _fit(scene, scene.counts, *how)
+    for _ in range(_ROUNDS):
+        fit = found[0]
+        flat = without_slopes(scene.counts, np.where((found[1] == 0)[:, None], fit, np.nan), spacing)
+        if flat is scene.counts:
+            break
+        found = _fit(scene, flat, *how)
+        known = np.isfinite(found[0]).all(axis=1)
+        at = found[0][known][:, [Y, X]].T
+        found[0][known, BACKGROUND] += ndimage.map_coordinates(scene.counts - flat, at, order=1, mode="nearest")
+    return found
+
+
 def _fit(
     scene: Scene,
+    counts: Places,
     places: Places,
     corner: NDArray[np.int64],
     inside: NDArray[np.bool_],
@@ -154,10 +180,10 @@ def _fit(
     if not inside.any():
         return fit, status, explained
     x, y = corner[inside].T
-    windows = cut_windows(scene.counts[None], y[None], x[None], window_px, blur_sigma_px)[0]
+    windows = cut_windows(counts[None], y[None], x[None], window_px, blur_sigma_px)[0]
     start, lower, upper = _bounds(windows, places[inside] - corner[inside], scene.sign, search)
     options: dict[str, Any] = {"blur_sigma_px": blur_sigma_px, "max_iterations": 200, "radius_px": window_px / 2}
-    filling = windows, np.where(scene.known, scene.counts, np.nan), corner[inside], blur_sigma_px
+    filling = windows, np.where(scene.known, counts, np.nan), corner[inside], blur_sigma_px
     moving = fill_holes(
         *filling, lambda some, n: fit_gaussians(some, start[n], lower[n], upper[n], **options).estimates
     )
