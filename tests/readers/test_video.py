@@ -6,6 +6,7 @@ import pickle
 import sys
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from files_video import write_video
@@ -63,3 +64,38 @@ def test_without_the_package_the_error_says_how_to_get_it(tmp_path: Path, monkey
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install .tract_dask\[video\]"):
         open_source(path)
+
+
+def damaged(path: Path, number: int) -> None:
+    """Flip one bit in the middle of a frame."""
+    with av.open(str(path)) as container:
+        places = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    content = bytearray(path.read_bytes())
+    content[places[number][0] + places[number][1] // 2] ^= 4
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("a.avi", "ffv1"), ("a.mov", "png")])
+def test_a_damaged_frame_is_refused_each_time_and_hides_no_other(name: str, codec: str, tmp_path: Path) -> None:
+    for number in (0, 7):
+        path = write_video(tmp_path / name, FRAMES, codec, g="1")
+        damaged(path, number)
+        source = open_source(path)
+        for _ in range(2):
+            with pytest.raises(SourceError, match=name):
+                source.read(number, number + 1)
+        with pytest.raises(SourceError, match=name):
+            source.read(0, 25)
+        for start, stop in ((0, number), (number + 1, 25)):
+            if stop > start:
+                np.testing.assert_array_equal(source.read(start, stop), FRAMES[start:stop])
+
+
+def test_frames_that_are_computed_from_a_damaged_one_are_refused(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.avi", FRAMES, "ffv1", g="10")
+    damaged(path, 12)
+    source = open_source(path)
+    with pytest.raises(SourceError, match=r"frame 1[2-5] of the video, or one that it is computed from, is damaged"):
+        source.read(15, 16)
+    for number in (11, 20):
+        np.testing.assert_array_equal(source.read(number, number + 1), FRAMES[number : number + 1])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,9 @@ _COLOUR = 3
 
 _EMPTY = -(2**63)
 
+_TRIED = 100
+"""From so many packets, at the beginning, the first whole frame is looked for."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoSource(Source):
@@ -41,11 +46,14 @@ class VideoSource(Source):
         Those of the frames from which decoding can begin.
     pixels
         Name of the pixel format that frames are converted to.
+    codec
+        Name of the codec.
     """
 
     stamps: NDArray[np.int64]
     keys: NDArray[np.int64]
     pixels: str
+    codec: str
 
     def _read(self, start: int, stop: int) -> Frames:
         frames = np.empty((stop - start, *self.shape[1:]), self.dtype)
@@ -65,16 +73,34 @@ class VideoSource(Source):
         """Yield the frames from ``start`` to ``stop`` (not included) with their numbers."""
         av = _package(self.path)
         checked_file(self.files[0])
-        with av.open(str(self.files[0]), metadata_errors="ignore") as container:
+        with _listening(av) as said, av.open(str(self.files[0]), metadata_errors="ignore") as container:
             stream = container.streams.video[0]
+            if self.codec in _LOSSLESS:
+                stream.codec_context.thread_count = 1  # what the decoder says of a frame is then said before it comes
             key = self.keys[max(0, int(np.searchsorted(self.keys, self.stamps[start], side="right")) - 1)]
             container.seek(int(key), stream=stream, backward=True)
+            said.clear()  # the first frame was decoded on opening
             for frame in container.decode(stream):
                 number = int(np.searchsorted(self.stamps, frame.pts if frame.pts is not None else _EMPTY))
                 if number >= stop or number >= len(self.stamps):
                     return
+                self._check_whole(
+                    number, [text for level, who, text in said if level <= av.logging.ERROR and who == self.codec]
+                )
                 if number >= start and self.stamps[number] == frame.pts and not frame.is_corrupt:
                     yield number, frame
+                if number == stop - 1:  # the next one may be damaged
+                    return
+
+    def _check_whole(self, number: int, said: list[str]) -> None:
+        """Refuse a frame that the decoder called damaged: in place of its pixels it gives those of another frame."""
+        if said and self.codec in _LOSSLESS:
+            raise SourceError(
+                f"frame {number} of the video, or one that it is computed from, is damaged",
+                self.path,
+                got=said[0].strip(),
+                remedy="Make the copy or the export again",
+            )
 
 
 def open_video(path: Path, inner: str, settings: SourceSettings, permit: Permit | None) -> VideoSource:
@@ -89,7 +115,7 @@ def open_video(path: Path, inner: str, settings: SourceSettings, permit: Permit 
     """
     av = _package(str(path))
     size = path.stat().st_size
-    with av.open(str(path), metadata_errors="ignore") as container:
+    with _listening(av), av.open(str(path), metadata_errors="ignore") as container:
         if not container.streams.video:
             raise SourceError("there is no video in this file", str(path), remedy="Name the movie's file")
         stream = container.streams.video[0]
@@ -99,7 +125,7 @@ def open_video(path: Path, inner: str, settings: SourceSettings, permit: Permit 
         stamps = np.array([pts for pts, _ in packets if pts is not None], np.int64)
         codec, kind, base = stream.codec_context.name, stream.codec_context.pix_fmt or "", float(stream.time_base or 0)
         container.seek(0, stream=stream)
-        first = next(container.decode(stream), None)
+        first = _first_whole(container, stream, av.FFmpegError)
         if first is None or len(stamps) < len(packets) or len(np.unique(stamps)) < len(stamps):
             raise SourceError(
                 "the frames of the video cannot be told apart",
@@ -124,7 +150,43 @@ def open_video(path: Path, inner: str, settings: SourceSettings, permit: Permit 
         stamps=stamps,
         keys=np.array([pts for pts, is_key in packets if is_key] or [stamps[0]], np.int64),
         pixels="gray16le" if deep else "gray",
+        codec=codec,
     )
+
+
+def _first_whole(container: Any, stream: Any, failure: type[Exception]) -> Any:
+    """Return the first frame that can be decoded, for a damaged one does not hide those behind it; None without frames.
+
+    Raises
+    ------
+    failure
+        Where none of the first ones can be decoded.
+    """
+    failed: Exception | None = None
+    for packet in islice(container.demux(stream), _TRIED):
+        try:
+            frames = packet.decode()
+        except failure as error:
+            failed = failed or error
+            continue
+        if frames:
+            return frames[0]
+    if failed is not None:
+        raise failed
+    return None
+
+
+def _listening(av: Any) -> AbstractContextManager[list[tuple[int, str, str]]]:
+    """Return a context with what FFmpeg says in this thread, which is all that some decoders do about damage.
+
+    The level is set for the process and stays: other threads may be reading.
+    """
+    level = av.logging.get_level()
+    if level is None or level < av.logging.ERROR:
+        av.logging.set_level(av.logging.ERROR)
+    av.logging.set_skip_repeated(False)
+    listening: AbstractContextManager[list[tuple[int, str, str]]] = av.logging.Capture()
+    return listening
 
 
 def _package(where: str) -> Any:
