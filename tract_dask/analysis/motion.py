@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..kernels.linear_motion import moved
+from ..stages.sites import fit_sites
 from ..store import results, schema
-from .sites import fit_sites
 from .weights import blocks, drawn_together, scatter_of
 
 AROUND = 100
@@ -113,7 +113,7 @@ def reference_positions(tracks: xr.Dataset) -> xr.DataArray:
 
 
 def places_in_frames(tracks: xr.Dataset) -> xr.DataArray:
-    """Return where the frames show the columns: with the drift, and with the motion that positions are freed from.
+    """Return where the frames show the columns: with the drift, and with what else positions are freed from.
 
     Parameters
     ----------
@@ -125,13 +125,15 @@ def places_in_frames(tracks: xr.Dataset) -> xr.DataArray:
     DataArray
         (frame, column_id, axis) in px of the movie, in memory.
     """
-    names = [name for name in ("fit", "drift", "motion") if name in tracks]
+    names = [name for name in ("fit", "drift", "motion", "row_shift") if name in tracks]
     some = tracks[names].sel(parameter=list(schema.AXES)).compute().transpose("frame", ...)
     places = some["fit"].transpose("frame", "column_id", "parameter").to_numpy()
     if "motion" in some and some["motion"].any():
         centre = np.array(tracks.attrs["motion_centre"])
         places = (centre + moved(places[..., ::-1] - centre, some["motion"].to_numpy()))[..., ::-1]
     places = places + some["drift"].to_numpy()[:, None]
+    if "row_shift" in some:
+        places[..., 1] += some["row_shift"].transpose("frame", "column_id").to_numpy()
     coords = {"frame": some["frame"], "column_id": some["column_id"], "axis": schema.texts(schema.AXES)}
     about = {"units": "px", "long_name": "Place of the column in the frame"}
     return xr.DataArray(places, coords, ("frame", "column_id", "axis"), attrs=about)

@@ -22,7 +22,7 @@ from ..store.damage import FRAME_AXES, METADATA
 from ..store.journal import Journal, entries, journal_beside
 from ..store.locks import sole_use
 from ..store.ome import AXES, CHANGING
-from ..store.parts import SHARDED, Parts, layout
+from ..store.parts import Parts, layout
 from ..store.shard_files import ABSENT, ELSEWHERE, MARKED, mark_of, read_index, trailing, unchecked
 from ..store.strangers import WHY, advice, strangers
 from .beside import Beside, look_beside
@@ -226,7 +226,7 @@ def _damaged_parts(store: Path, key: str) -> list[Fault]:
             continue
         fault = Fault(parts.file(index), store, "fit", "damaged", "", frames)
         try:
-            for name in SHARDED:
+            for name in parts.names(index):
                 parts.stored(index, name)
         except OSError as error:
             faults.append(dataclasses.replace(fault, what="unreadable", why=error.strerror or str(error)))

@@ -275,8 +275,24 @@ class FitSettings(Settings):
         None, "IDs of the columns that stand still by definition; unset: the largest part that keeps its distances"
     )
 
+    scan_rows: str = setting(
+        "off",
+        "Free x of columns from the offsets of single rows of scanned frames (STEM): against their places in the summed"
+        " image (sum), or on a lattice, for few frames",
+        choices=("off", "sum", "lattice"),
+        common=True,
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.scan_rows != "off" and self.filters_frames:
+            raise SettingsError(
+                "a filter of whole frames hides the offsets of rows",
+                "setting scan_rows (FitSettings)",
+                "filter gaussian or none",
+                repr(self.filter),
+                "Choose another filter, or scan_rows off",
+            )
         if self.estimator == "poisson" and self.filters_frames:
             raise SettingsError(
                 "filtered frames are not counts",

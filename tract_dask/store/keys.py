@@ -102,6 +102,7 @@ KEYED: dict[str, tuple[Keyed, ...]] = {
         Keyed("fit.max_iterations", 50),
         Keyed("fit.drift_columns", None),
         Keyed("fit.search_px", None),
+        Keyed("fit.scan_rows", "off"),
     ),
 }
 """The settings of each stage's key. The other settings count by what comes of them: :data:`OTHERWISE`."""

@@ -32,7 +32,12 @@ CODEC = "lz4"
 SHARDED = tuple(name for name in schema.RESULTS if name not in ("drift_measured", "time"))
 """The variables of which every shard of the movie makes one piece; the others are known from the start."""
 
-_TAIL_BYTES = 8 * (1 + len(SHARDED)) + CHECKSUM_BYTES
+WRITTEN = schema.RESULTS | schema.SCAN_ROWS
+
+EVERY = (*SHARDED, *schema.SCAN_ROWS)
+"""These, and those that some results have: in parts of the others their pieces are empty."""
+
+_TAIL_BYTES = 8 * (1 + len(EVERY)) + CHECKSUM_BYTES
 
 _ABSENT = 2**64 - 1
 
@@ -48,7 +53,7 @@ def write(run: Path, shard: Shard, values: dict[str, NDArray[Any]], frames_per_s
 
     Pieces have the frames of a whole shard; those of the last shard are filled up.
     """
-    pieces = [piece(name, values[name], frames_per_shard) for name in SHARDED]
+    pieces = [piece(name, values[name], frames_per_shard) if name in values else b"" for name in EVERY]
     lengths = [*map(len, pieces)]
     tail = np.array([shard.index, *lengths], "<u8").tobytes()
     with disk_errors(run):
@@ -57,7 +62,7 @@ def write(run: Path, shard: Shard, values: dict[str, NDArray[Any]], frames_per_s
 
 def piece(name: str, array: NDArray[Any], frames: int) -> bytes:
     """Return the values of a variable for the frames of one shard as a piece, with the frames of a whole shard."""
-    variable = schema.RESULTS[name]
+    variable = WRITTEN[name]
     chunk = np.full((frames, *array.shape[1:]), variable.fill, variable.dtype)
     chunk[: len(array)] = array
     data = bytes(encode(chunk, CODEC))
@@ -113,7 +118,7 @@ class Parts:
         end = int(self.place[index, 1])
         with self.file(index).open("rb", buffering=0) as file:
             lengths = self._lengths(file.fileno(), index, end)
-            k = SHARDED.index(name)
+            k = EVERY.index(name)
             start = end - _TAIL_BYTES - sum(lengths[k:])
             piece = os.pread(file.fileno(), lengths[k], max(0, start))
         unchecked(memoryview(piece))
@@ -127,6 +132,12 @@ class Parts:
         if own != index or sum(lengths) > end:
             raise ValueError("this is the part of another shard")
         return lengths
+
+    def names(self, index: int) -> list[str]:
+        """Return the variables of which a part has pieces; errors as of :meth:`stored`."""
+        with self.file(index).open("rb", buffering=0) as file:
+            lengths = self._lengths(file.fileno(), index, int(self.place[index, 1]))
+        return [name for name, length in zip(EVERY, lengths, strict=True) if length]
 
     def read(self, index: int, name: str, out: NDArray[Any]) -> None:
         """Decode the piece of a variable into ``out``, (frames of a whole shard, ...).
@@ -154,7 +165,7 @@ class Parts:
         """Spoil the ends of parts that are damaged: nobody takes their shards for done any more."""
         for index in np.flatnonzero(self.done).tolist():
             try:
-                for name in SHARDED:
+                for name in self.names(index):
                     self.stored(index, name)
             except ValueError:
                 with self.file(index).open("r+b", buffering=0) as file:
@@ -218,9 +229,14 @@ def layout(path: Path) -> tuple[int, int, int]:
     return fit.shape[0], fit.chunks[0], (fit.shards or fit.chunks)[0] // fit.chunks[0]
 
 
+def sharded(path: Path) -> list[str]:
+    """Return the variables of the store at ``path`` of which every shard of the movie makes one piece."""
+    return [name for name in EVERY if name in SHARDED or (path / name).is_dir()]
+
+
 def file_place(name: str) -> list[int]:
     """Return the numbers that follow a file's own in the name of a file of a variable: zeros, for its other axes."""
-    return [0] * (len(schema.RESULTS[name].dims) - 1)
+    return [0] * (len(WRITTEN[name].dims) - 1)
 
 
 def joined(

@@ -21,7 +21,7 @@ from ..settings.run import FitSettings
 from ..settings.toml import from_toml
 from . import datasets, disk, files, metadata, schema
 from .journal import Journal, journal_beside
-from .parts import CODEC, SHARDED, Growing, Parts, file_place, joined, layout
+from .parts import CODEC, EVERY, SHARDED, WRITTEN, Growing, Parts, file_place, joined, layout, sharded
 from .schema import Status, is_accepted
 from .shard_files import CHUNK_KEYS, MARKED, chunk_path, codecs
 from .source_pixels import with_source_coordinates
@@ -51,7 +51,7 @@ def damage(path: Path) -> StoreError | None:
         Where it cannot be read.
     """
     try:
-        datasets.open_dataset(path, only=[name for name in metadata.nodes(path) if name not in SHARDED])
+        datasets.open_dataset(path, only=[name for name in metadata.nodes(path) if name not in EVERY])
     except StoreError as error:
         if metadata.is_of_system(error):
             raise
@@ -66,6 +66,7 @@ def create(
     time: np.ndarray[Any, Any],
     frames_per_shard: int,
     frame_values: Mapping[str, xr.Variable] | None = None,
+    rows: int | None = None,
     **about: Any,
 ) -> None:
     """Create the store at ``path``, whole or not at all.
@@ -80,10 +81,12 @@ def create(
         Frames in an inner chunk of every variable: those of a movie shard.
     frame_values
         Coordinates on ``frame``, such as the temperature.
+    rows
+        Rows of a frame, for the variables on their offsets; None: without these.
     about
         Attributes under :data:`.metadata.ATTRIBUTE`.
     """
-    sizes = {"frame": len(time), "column_id": columns.sizes["column_id"]} | schema.SIZES
+    sizes = {"frame": len(time), "column_id": columns.sizes["column_id"], "row": rows or 0} | schema.SIZES
     known = {"drift_measured": drift, "time": time}
     static = columns.assign_coords(schema.coordinates(len(time)) | dict(frame_values or {}))
     static = static.assign({name: (schema.RESULTS[name].dims, values) for name, values in known.items()})
@@ -100,7 +103,7 @@ def create(
         files.remove(aside)
         datasets.write_arrays(static, aside)
         group = zarr.open_group(aside, mode="a")
-        for variable in map(schema.RESULTS.__getitem__, SHARDED):
+        for variable in map(WRITTEN.__getitem__, SHARDED if rows is None else EVERY):
             shape = tuple(sizes[dim] for dim in variable.dims)
             group.create_array(
                 variable.name,
@@ -188,7 +191,7 @@ def variables(path: Path) -> Callable[[str], Any]:
 
     def opened(name: str) -> Any:
         array = datasets.open_array(path / name)
-        return array if parts is None or name not in SHARDED else Growing(array, name, parts)
+        return array if parts is None or name not in EVERY else Growing(array, name, parts)
 
     return opened
 
@@ -204,7 +207,7 @@ def growing_files(path: Path) -> list[tuple[Path, Iterator[bytes]]]:
     for number, start in enumerate(range(0, len(parts.done), per_file)):
         shards = range(start, min(start + per_file, len(parts.done)))
         if parts.done[shards].any():
-            for name in SHARDED:
+            for name in sharded(path):
                 file = chunk_path(path / name, number, *file_place(name))
                 found.append((file, joined(parts, str(about.get("key")), name, shards, per_file)))
     return found
@@ -215,7 +218,7 @@ def stored_bytes(path: Path) -> int:
     parts = _parts(path)
     if parts is not None:
         return sum((parts.run / name).stat().st_size for name in parts.files)
-    return sum(file.stat().st_size for name in SHARDED for file in (path / name).glob("c.*"))
+    return sum(file.stat().st_size for name in sharded(path) for file in (path / name).glob("c.*"))
 
 
 def _parts(path: Path) -> Parts | None:
@@ -266,7 +269,8 @@ def open_results(path: str | Path, *, unfinished: bool = False) -> xr.Dataset:
         )
     frames, *rest = stored["fit"].encoding["chunks"]
     frames *= max(1, _CHUNK_BYTES // (8 * frames * math.prod(rest)))
-    beside = [of.name for of in (*schema.OF_GROUPS, schema.SHAPE_ERROR) if of.name in stored]  # earlier ones have none
+    some = (*schema.OF_GROUPS, schema.SHAPE_ERROR, *schema.SCAN_ROWS.values())
+    beside = [of.name for of in some if of.name in stored]
     dataset = stored[[*schema.RESULTS, *schema.COLUMNS, *beside]].chunk(frame=frames)
     if not about.get("complete"):
         dataset = _grown(dataset, path)
@@ -310,7 +314,7 @@ def _grown(dataset: xr.Dataset, path: Path) -> xr.Dataset:
     opened = variables(path)
     lazy = {
         name: da.from_array(opened(name), chunks=dataset[name].data.chunksize, name=False, fancy=False)
-        for name in SHARDED
+        for name in sharded(path)
     }
     return dataset.assign({name: dataset[name].copy(data=values) for name, values in lazy.items()})
 

@@ -184,6 +184,13 @@ RESULTS = _declare(
 )
 """results.zarr: the tracks."""
 
+SCAN_ROWS = _declare(
+    Variable("row_offset", ("frame", "row"), "float64", "px", "Offset of a row of the frame along x", _NAN),
+    Variable("row_offset_stderr", ("frame", "row"), "float64", "px", "Standard error of the offset", _NAN),
+    Variable("row_shift", _COLUMN, "float64", "px", "What offsets of rows had added to x, which is freed from it", 0.0),
+)
+"""Variables that results have beside these where offsets of scanned rows are undone."""
+
 COLUMNS = _declare(
     Variable("x_ref", ("column_id",), "float64", "px", "Position in the summed image", _NAN),
     Variable("y_ref", ("column_id",), "float64", "px", "Position in the summed image", _NAN),

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ...export.tables import export
-from ...store.parts import SHARDED
+from ...store.parts import EVERY
 from ...store.results import growing_files
 from ..process_pool import ProcessPool
 from .tracks import open_finished
@@ -93,11 +93,7 @@ def _contents(results: Path) -> Iterator[tuple[zipfile.ZipInfo, Iterator[bytes]]
     for path in sorted(results.rglob("*")):
         inside = path.relative_to(results)
         hidden = any(part.startswith(".") for part in inside.parts)
-        if (
-            path.is_file()
-            and not hidden
-            and not (growing and path.name.startswith("c.") and path.parent.name in SHARDED)
-        ):
+        if path.is_file() and not hidden and not (growing and path.name.startswith("c.") and path.parent.name in EVERY):
             yield _entry(path, inside.as_posix()), _pieces(path)
     for path, pieces in growing or ():
         yield _entry(results / "zarr.json", path.relative_to(results).as_posix()), pieces

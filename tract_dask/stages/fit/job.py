@@ -34,6 +34,7 @@ from .cells import Cells
 from .goodness import Freedom
 from .groups import Groups, plan_groups
 from .noise_size import WindowNoise, window_noise
+from .row_homes import check_frames, sites_of
 from .same_atom import Pairs
 from .shape_error import shape_errors
 from .vacuum import check_box, find_vacuum, why_unusable
@@ -94,6 +95,7 @@ class Job:
             movie.times(),
             movie.shards[0].frames,
             movie.frame_values(),
+            rows=None if self.settings.scan_rows == "off" else movie.shape[1],
             **provenance(key, self.settings, str(movie.path)),
             **calibration(movie),
             **{MOVIE_KEY: movie.key},
@@ -229,6 +231,14 @@ class Job:
         return Pairs.of(self.reference, self.reach_px)
 
     @cached_property
+    def row_sites(self) -> Floats | None:
+        """(columns, ...) sites of the lattice that offsets of scanned rows are measured against, if they are so."""
+        if self.settings.scan_rows != "lattice":
+            return None
+        places = np.where(self.known[:, None], self.reference[:, [Y, X]], np.nan)
+        return sites_of(places, schema.texts(self.columns["kind"].to_numpy()))
+
+    @cached_property
     def window_noise(self) -> WindowNoise:
         """What each column's window does with noise."""
         shared = None if self.correlation is None else np.array(self.correlation)
@@ -313,7 +323,9 @@ def prepare(
     if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0 and movie.pixels.dark is None:
         check_counts(statistics["frame_min"].to_numpy())
     measured = drift is not None and drift.attrs.get("method") != "none"
-    return Job(
+    usable = int(np.count_nonzero(~bad)) - len(_lost(drift))
+    check_frames(settings, usable)
+    job = Job(
         columns,
         shift,
         bad,
@@ -329,9 +341,12 @@ def prepare(
         dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
         correlation=camera.correlation if camera.shared.size > 1 else None,
         full_scale=_full_scale(movie),
-        summed=_summed_frames(movie, columns, summed, int(np.count_nonzero(~bad)) - len(_lost(drift))),
+        summed=_summed_frames(movie, columns, summed, usable),
         frame=movie.shape[1:],
     )
+    if settings.scan_rows == "lattice":
+        _ = job.row_sites  # where the columns make no lattice, this says so before the fits
+    return job
 
 
 def _window_px(movie: Movie, columns: xr.Dataset, settings: FitSettings) -> int:

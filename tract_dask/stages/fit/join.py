@@ -15,7 +15,7 @@ from ...progress import Sink, silent
 from ...store import disk, schema
 from ...store.files import disk_errors
 from ...store.journal import Journal, Payload
-from ...store.parts import AGAIN, SHARDED, DamagedPartError, Parts, checked, file_place, joined, layout, piece
+from ...store.parts import AGAIN, DamagedPartError, Parts, checked, file_place, joined, layout, piece, sharded
 from ...store.shard_files import chunk_path
 from ...store.shards import Shard, split
 from .crystal import CHANGED, Crystal
@@ -97,7 +97,7 @@ def _join_task(job: _Joining, file: Shard) -> Payload:
         raise DamagedPartError("the fits of some shards are no longer on disk", str(parts.run), remedy=AGAIN)
     changed = _put_right(job, parts, shards)
     with disk_errors(job.path), ExitStack() as stack:
-        for name in SHARDED:
+        for name in sharded(job.path):
             place = disk.new_place(job.aside)
             stack.callback(place.unlink, missing_ok=True)
             with place.open("wb") as target:

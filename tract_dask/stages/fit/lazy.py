@@ -55,8 +55,9 @@ def fit_columns(
 
     job = calibrated(prepare(movie, columns, drift, settings or FitSettings(), summed=summed))
     still = named(job)
-    sizes = {"frame": movie.n_frames, "column_id": len(job.reference)} | schema.SIZES
+    sizes = {"frame": movie.n_frames, "column_id": len(job.reference), "row": movie.shape[1]} | schema.SIZES
     fitted = {name: of for name, of in schema.RESULTS.items() if name not in ("time", "drift_measured")}
+    fitted |= schema.SCAN_ROWS if job.settings.scan_rows != "off" else {}
 
     def fit_shard(index: int) -> Values:
         values = measure(movie, movie.shards[index], job)

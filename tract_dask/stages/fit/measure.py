@@ -31,6 +31,7 @@ from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 from .noise_size import frame_noise
 from .places import Places
 from .same_atom import on_one_atom
+from .scan_rows import undone
 from .search import search
 from .window_fits import bounds_of, fit_windows
 
@@ -56,7 +57,7 @@ def measure(movie: Movie, shard: Shard, job: Job, *, whole: bool = False) -> Val
     beside it one filtered frame. ``whole`` reads whole frames, which need not begin with a layer of tiles.
     """
     job = job.in_units
-    whole = whole or job.settings.filters_frames
+    whole = whole or job.settings.filters_frames or job.settings.scan_rows != "off"
     parts = [_measure_frames(*pixels, job) for pixels in _read(movie, shard, job, whole)]
     return {name: np.concatenate([values[name] for values in parts]) for name in parts[0]}
 
@@ -115,6 +116,9 @@ def _measure_frames(places: Places, pixels: _Pixels, job: Job, rounds: int = _RO
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
     weakest = job.settings.threshold * job.scale * noise
     status = status_of(in_frame, places, weakest)
+    rows: Values = {}
+    if job.settings.scan_rows != "off":
+        in_frame, rows = undone(in_frame, status, places, tiles, gain, job)
     common = common_motion(in_frame.estimates, status, places.drift, job)
     if rounds and (displaced := _carried(common, places, job)) is not None:
         again = Places.of(tiles.shape, places.start, pixels.stop, job, displaced)
@@ -147,6 +151,7 @@ def _measure_frames(places: Places, pixels: _Pixels, job: Job, rounds: int = _RO
         "motion_measured": common.linear,
         "motion_stderr": common.stderr,
         "noise": job.unit * noise,
+        **rows,
     }
 
 

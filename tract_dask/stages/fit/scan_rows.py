@@ -1,0 +1,69 @@
+"""Scanned frames whose rows are displaced: positions are freed from that, and no pixel is resampled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...kernels.gaussian.model import blurred
+from ...kernels.gaussian.parameters import X
+from ...kernels.scan_rows import displaced_rows
+from ...kernels.windows import Tiles, blur_variance, cut_windows
+from ...store.schema import is_accepted
+from .frame_fits import FrameFits
+from .job import Job
+from .places import Places
+from .row_homes import on_sites
+
+Floats = NDArray[np.float64]
+Values = dict[str, NDArray[Any]]
+
+
+def undone(
+    fits: FrameFits, status: NDArray[np.uint16], places: Places, tiles: Tiles, gain: float, job: Job
+) -> tuple[FrameFits, Values]:
+    """Return fits whose x are freed from displaced rows, and what was found of these.
+
+    Parameters
+    ----------
+    fits
+        In the coordinates of the frames.
+    tiles
+        Whole frames.
+
+    Returns
+    -------
+    Fits with other x, its error and centroid; ``row_offset`` and ``row_offset_stderr`` (frames, rows) and ``row_shift``
+    (frames, columns), what was taken off.
+    """
+    (n_frames, n_columns), (height, width) = status.shape, places.shape
+    offset, stderr = np.full((2, n_frames, height), np.nan)
+    estimates, errors, centroid = fits.estimates.copy(), fits.stderr.copy(), fits.centroid.copy()
+    shift, zero = np.zeros((n_frames, n_columns)), np.zeros((1, 1), np.int64)
+    blur = blur_variance(job.settings.window_blur_px)
+    for k in np.flatnonzero(~(places.bad | places.lost)).tolist():
+        image = cut_windows(tiles, zero, zero, (height, width), 0.0, gain, k)[0, 0].astype(np.float64) - job.floor
+        seen = np.where(is_accepted(status[k])[:, None], fits.estimates[k], np.nan)
+        sites = job.row_sites
+        home = _home(seen, places, k, job) if sites is None else on_sites(seen[:, X], sites)
+        raw, counting = blurred(seen, -blur), job.settings.counting
+        found = displaced_rows(image, raw, home, job.window_px, counting=counting)
+        offset[k], stderr[k] = found.offset, np.sqrt(found.variance)
+        known = np.isfinite(found.x)
+        shift[k, known] = (seen[:, X] - found.x)[known]
+        errors[k, known, X] = np.sqrt(found.x_variance[known])
+    estimates[..., X] -= shift
+    centroid[..., 1] -= shift
+    found_all: Values = {"row_offset": offset, "row_offset_stderr": stderr, "row_shift": shift}
+    return replace(fits, estimates=estimates, stderr=errors, centroid=centroid), found_all
+
+
+def _home(seen: Floats, places: Places, frame: int, job: Job) -> Floats:
+    """Return x where columns of a frame belong, (n,): as in the summed image, moved as most of them are."""
+    displaced = places.displaced[frame, :, 1] if places.displaced.shape[1] > 1 else places.displaced[frame, 0, 1]
+    home = job.reference[:, X] + places.drift[frame, 1] + displaced
+    away = (seen[:, X] - home)[np.isfinite(seen[:, X])]
+    return np.where(job.known, home + (np.median(away) if away.size else 0.0), np.nan)
