@@ -44,6 +44,10 @@ class FrameFits:
         fields = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
         return cls(**{name: values.reshape(*shape, *values.shape[1:]) for name, values in fields.items()})
 
+    def good(self, unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which fits have converged within their bounds, but for those that are ``unseen`` (frames, columns)."""
+        return self.converged & ~(self.held | unseen)
+
     def without(self, outside: NDArray[np.bool_], bad: NDArray[np.bool_]) -> FrameFits:
         """Return the same with NaN for windows ``outside`` (frames, columns), and for centroids of ``bad`` frames."""
         names = ("estimates", "stderr", "volume_stderr", "r_squared", "centroid", "strength", "residual", "ratio")

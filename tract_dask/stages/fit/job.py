@@ -238,6 +238,17 @@ class Job:
         places = np.where(self.known[:, None], self.reference[:, [Y, X]], np.nan)
         return sites_of(places, schema.texts(self.columns["kind"].to_numpy()))
 
+    def check_rows(self, usable: int) -> None:
+        """Check that columns say where they belong along x, in so many usable frames, if that is asked for.
+
+        Raises
+        ------
+        SettingsError
+            Where frames are too few for their sum, or the columns make no lattice.
+        """
+        check_frames(self.settings, usable)
+        _ = self.row_sites
+
     @cached_property
     def window_noise(self) -> WindowNoise:
         """What each column's window does with noise."""
@@ -308,8 +319,7 @@ def prepare(
     """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
     schema.validate(columns, schema.COLUMNS, "columns")
     shift = schema.drift_of(drift, movie.n_frames)
-    blur = resolve_blur(settings.blur_sigma_px, columns)
-    settings = replace(settings, blur_sigma_px=blur)
+    settings = replace(settings, blur_sigma_px=(blur := resolve_blur(settings.blur_sigma_px, columns)))
     _check_drift_columns(settings, columns)
     box = settings.vacuum_box
     check_box(box, movie.shape[1:], shift)
@@ -322,9 +332,7 @@ def prepare(
     camera = camera_of(movie, summed)
     if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0 and movie.pixels.dark is None:
         check_counts(statistics["frame_min"].to_numpy())
-    measured = drift is not None and drift.attrs.get("method") != "none"
-    usable = int(np.count_nonzero(~bad)) - len(_lost(drift))
-    check_frames(settings, usable)
+    usable = int(np.count_nonzero(~bad)) - len(lost := _lost(drift))
     job = Job(
         columns,
         shift,
@@ -334,9 +342,9 @@ def prepare(
         unusable=unusable,
         reference_blur_px=columns.attrs.get("blur_sigma_px", blur),
         rounding_variance=columns.attrs.get("rounding_variance_px2", 0.0),
-        refined_by=settings.refine_columns if settings.refine_drift and measured else None,
+        refined_by=_refined_by(settings, drift),
         settings=settings,
-        lost=_lost(drift),
+        lost=lost,
         offset=movie.gain * movie.offset,
         dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
         correlation=camera.correlation if camera.shared.size > 1 else None,
@@ -344,9 +352,14 @@ def prepare(
         summed=_summed_frames(movie, columns, summed, usable),
         frame=movie.shape[1:],
     )
-    if settings.scan_rows == "lattice":
-        _ = job.row_sites  # where the columns make no lattice, this says so before the fits
+    job.check_rows(usable)
     return job
+
+
+def _refined_by(settings: FitSettings, drift: xr.Dataset | None) -> int | None:
+    """Return the fewest columns that may refine the drift of a frame; None where it stays as it was measured."""
+    measured = drift is not None and drift.attrs.get("method") != "none"
+    return settings.refine_columns if settings.refine_drift and measured else None
 
 
 def _window_px(movie: Movie, columns: xr.Dataset, settings: FitSettings) -> int:

@@ -31,7 +31,7 @@ from .levels import Vacuum, noise_at_columns, noise_without_vacuum
 from .noise_size import frame_noise
 from .places import Places
 from .same_atom import on_one_atom
-from .scan_rows import undone
+from .scan_rows import free_hopped, undone
 from .search import search
 from .window_fits import bounds_of, fit_windows
 
@@ -109,26 +109,24 @@ def _measure_frames(places: Places, pixels: _Pixels, job: Job, rounds: int = _RO
     """
     tiles, gain = pixels.tiles(places.boxes(job)), pixels.gain
     in_frame = fit_places(places, tiles, gain, job).without(places.outside, places.bad).moved(places.corner)
-    good = in_frame.converged & ~(in_frame.held | places.outside | places.bad[:, None]) & job.counted
-    window = job.window_noise
+    good, window = in_frame.good(places.outside | places.bad[:, None]) & job.counted, job.window_noise
     size, number = frame_noise(in_frame.ratio, good, window.left, window.free)
     in_frame = in_frame.with_noise(size)
     noise, precision, empty = _noise(places, tiles, gain, in_frame, job)
     weakest = job.settings.threshold * job.scale * noise
     status = status_of(in_frame, places, weakest)
-    rows: Values = {}
-    if job.settings.scan_rows != "off":
-        in_frame, rows = undone(in_frame, status, places, tiles, gain, job)
+    in_frame, rows = undone(in_frame, status, places, tiles, gain, job)
     common = common_motion(in_frame.estimates, status, places.drift, job)
     if rounds and (displaced := _carried(common, places, job)) is not None:
         again = Places.of(tiles.shape, places.start, pixels.stop, job, displaced)
         return _measure_frames(again, pixels, job, rounds - 1)
+    drift: Floats = places.drift + common.shift
     hopped = search(in_frame, status, places, pixels.tiles, gain, (precision, size), common.shift, job)
+    free_hopped(in_frame, hopped, rows, job)
     status = status_of(in_frame, places, weakest) | np.where(hopped, Status.HOPPED, 0).astype(np.uint16)
-    home = job.reference[:, [Y, X]] + (places.drift + common.shift)[:, None] + places.displaced
+    home = job.reference[:, [Y, X]] + drift[:, None] + places.displaced
     taken = on_one_atom(in_frame.estimates, home, is_accepted(status), job.near)
     status |= np.where(taken, Status.SAME_ATOM | Status.BELOW_NOISE, 0).astype(np.uint16)
-    drift: Floats = places.drift + common.shift
     fits = in_frame.moved(-drift[:, None]).scaled(job.unit)
     fits.estimates[..., BACKGROUND] -= job.dark_variance
     chance = p_values(in_frame.ratio, size, window.left, window.level, job.freedom, number)

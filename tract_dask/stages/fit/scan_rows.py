@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.model import blurred
-from ...kernels.gaussian.parameters import X
+from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
 from ...kernels.scan_rows import displaced_rows
 from ...kernels.windows import Tiles, blur_variance, cut_windows
 from ...store.schema import is_accepted
@@ -25,7 +25,7 @@ Values = dict[str, NDArray[Any]]
 def undone(
     fits: FrameFits, status: NDArray[np.uint16], places: Places, tiles: Tiles, gain: float, job: Job
 ) -> tuple[FrameFits, Values]:
-    """Return fits whose x are freed from displaced rows, and what was found of these.
+    """Return fits whose x are freed from displaced rows, and what was found of these; without the setting, nothing.
 
     Parameters
     ----------
@@ -39,6 +39,8 @@ def undone(
     Fits with other x, its error and centroid; ``row_offset`` and ``row_offset_stderr`` (frames, rows) and ``row_shift``
     (frames, columns), what was taken off.
     """
+    if job.settings.scan_rows == "off":
+        return fits, {}
     (n_frames, n_columns), (height, width) = status.shape, places.shape
     offset, stderr = np.full((2, n_frames, height), np.nan)
     estimates, errors, centroid = fits.estimates.copy(), fits.stderr.copy(), fits.centroid.copy()
@@ -59,6 +61,22 @@ def undone(
     centroid[..., 1] -= shift
     found_all: Values = {"row_offset": offset, "row_offset_stderr": stderr, "row_shift": shift}
     return replace(fits, estimates=estimates, stderr=errors, centroid=centroid), found_all
+
+
+def free_hopped(fits: FrameFits, hopped: NDArray[np.bool_], rows: Values, job: Job) -> None:
+    """Free x of columns that were found away from their places from the offsets of the rows there, in place."""
+    for frame, column in zip(*np.nonzero(hopped), strict=True) if rows else ():
+        offset, stderr = rows["row_offset"][frame], rows["row_offset_stderr"][frame]
+        away = np.arange(len(offset)) - fits.estimates[frame, column, Y]
+        share = np.exp(-(away**2) / (job.reference[column, SIGMA_A] * job.reference[column, SIGMA_B]))
+        share /= share.sum()
+        shift = float(share @ offset)
+        rows["row_shift"][frame, column] = shift
+        fits.estimates[frame, column, X] -= shift
+        fits.centroid[frame, column, 1] -= shift
+        fits.stderr[frame, column, X] = np.hypot(
+            fits.stderr[frame, column, X], np.sqrt((share * stderr) @ (share * stderr))
+        )
 
 
 def _home(seen: Floats, places: Places, frame: int, job: Job) -> Floats:
