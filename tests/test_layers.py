@@ -77,6 +77,7 @@ INSIDE: dict[str, dict[str, list[str]]] = {
         "gaussian": ["vectors", "windows"],
         "centroids": ["vectors"],
         "presence": ["vectors", "windows", "gaussian"],
+        "scan_rows": ["gaussian"],
         "strength_maps": ["presence", "vectors"],
         "sums": [],
         "registration": ["sums"],

@@ -33,7 +33,7 @@ def check_frames(settings: FitSettings, usable: int) -> None:
     """
     if settings.scan_rows == "sum" and usable < _FEWEST_FRAMES:
         raise SettingsError(
-            "the sum of so few frames is displaced as they are",
+            "rows of the sum of so few frames are displaced, too",
             "setting scan_rows (FitSettings)",
             f"{_FEWEST_FRAMES} frames or more",
             f"{usable}",
