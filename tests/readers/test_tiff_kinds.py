@@ -286,3 +286,20 @@ def test_serialems_file_beside_a_tiff(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", WORDS, metadata=None, photometric="minisblack")
     (tmp_path / "a.tif.mdoc").write_text("[FrameSet = 0]\nPixelSpacing = 0.5\nExposureTime = 3\nNumSubFrames = 6\n")
     assert (known(tmp_path / "a.tif").pixel_size_pm, known(tmp_path / "a.tif").frame_time_s) == (50.0, 0.5)
+
+
+@pytest.mark.parametrize("compression", ["jpeg", "jpeg2000"])
+def test_images_inside_pages_that_are_cut_off_are_refused(compression: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    frames = np.random.default_rng(3).poisson(9, (3, 40, 36)).astype("u1")
+    tifffile.imwrite(path, frames, compression=compression, photometric="minisblack")
+    with tifffile.TiffFile(path) as tiff:
+        places = [(page.dataoffsets[0], page.databytecounts[0]) for page in tiff.pages]
+    whole = open_source(path).read(0, 3)
+    content = bytearray(path.read_bytes())
+    offset, n_bytes = places[1]
+    content[offset + n_bytes // 2 : offset + n_bytes] = bytes(n_bytes - n_bytes // 2)
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match=r"an image inside page 1 .* is cut off"):
+        open_source(path).read(0, 3)
+    np.testing.assert_array_equal(open_source(path).read(2, 3), whole[2:])

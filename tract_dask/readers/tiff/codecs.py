@@ -1,4 +1,4 @@
-"""What compressed strips and tiles say of their own size, looked at before a codec believes it."""
+"""What compressed strips and tiles say of their own size and end, looked at before a codec believes it."""
 
 from __future__ import annotations
 
@@ -19,25 +19,30 @@ CODECS |= {50002: "JPEG XL", 52546: "JPEG XL", 65000: "EER", 65001: "EER", 65002
 PART_BYTES = 16 << 20
 """A strip or a tile may take so many bytes, and twice those of its page."""
 
+_WITH_END, _END, _OLD_JPEG = ("JPEG", "JPEG 2000"), b"\xff\xd9", 6
+"""The marker at the end of an image, which is nowhere else in its pixels; old JPEG strips are parts of an image."""
+
 _MOST_SCANS, _MOST_TILES = 100, 4096
 
 
 def check_codestreams(file: Any, page: Any, path: str) -> None:
-    """Check the size that each image inside a page claims; ``file`` and ``page`` are tifffile's.
+    """Check the size that each image inside a page claims, and that it ends; ``file`` and ``page`` are tifffile's.
 
     Raises
     ------
     SourceError
-        Where one is far larger than the page.
+        Where one is far larger than the page, or cut off: the codecs give grey in place of what is missing.
     """
-    measure = _MEASURES.get(CODECS.get(int(page.compression), ""))
+    codec = CODECS.get(int(page.compression), "")
+    measure = _MEASURES.get(codec)
     if measure is None:
         return
     itemsize = page.dtype.itemsize if page.dtype is not None else 1
     most = PART_BYTES + 2 * page.imagelength * page.imagewidth * itemsize
     for offset, n_bytes in zip(page.dataoffsets, page.databytecounts, strict=False):
         file.seek(offset)
-        claimed = measure(file.read(n_bytes)) * itemsize
+        data = file.read(n_bytes)
+        claimed = measure(data) * itemsize
         if claimed > most:
             raise SourceError(
                 f"an image inside page {page.index} (counted from 0) is far larger than the page",
@@ -45,6 +50,14 @@ def check_codestreams(file: Any, page: Any, path: str) -> None:
                 f"at most {most:,} bytes",
                 f"{claimed:,} bytes",
                 "The file is damaged: export the movie again",
+            )
+        if codec in _WITH_END and data and int(page.compression) != _OLD_JPEG and data.rfind(_END) < 0:
+            raise SourceError(
+                f"an image inside page {page.index} (counted from 0) is cut off",
+                path,
+                f"the {codec} marker of its end",
+                "none",
+                "Make the copy or the export again",
             )
 
 
