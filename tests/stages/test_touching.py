@@ -10,6 +10,7 @@ from tract_dask.kernels.gaussian.joint import fit_joint
 from tract_dask.kernels.gaussian.model import evaluate, gaussian_image
 from tract_dask.kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from tract_dask.settings import ColumnSettings
+from tract_dask.stages.columns.group_fits import shared_by_pixels
 from tract_dask.stages.columns.unresolved import blind_pairs, merged
 from tract_dask.store.columns import column_dataset, positions
 
@@ -122,3 +123,21 @@ def test_one_column_for_two_has_their_volume_and_moments():
     for weight in (x, y, x * x, x * y, y * y):
         assert (weight * one).sum() == pytest.approx((weight * both).sum(), rel=2e-3)
     assert columns[0, AMPLITUDE] < 180
+
+
+def test_noise_that_pixels_share_calls_for_no_shapes_of_their_own():
+    """Members of one shape mostly keep one; where pixels are taken for independent two of three pairs have two."""
+    image, _ = crystal(1.8, noise=0.1, shared_px=1.0, seed=3)
+    columns = find_columns(image, ColumnSettings(contrast="bright"))
+    fits = columns["fit_ref"].to_numpy()[columns["group"].to_numpy() > 0]
+    assert len(fits) >= 40
+    sigmas = fits[:, 3:5].reshape(-1, 2, 2)
+    assert (np.ptp(sigmas, axis=1) == 0).all(axis=1).mean() > 0.8
+
+
+@pytest.mark.parametrize("blur_px", [0.0, 1.0, 2.0])
+def test_how_far_pixels_share_noise_is_measured(blur_px):
+    noise = np.random.default_rng(5).normal(size=(40, 41, 45))
+    left = ndimage.gaussian_filter(noise, (0, blur_px, blur_px))
+    found = shared_by_pixels(left, np.ones(left.shape, bool), 4 + round(3 * blur_px))
+    assert found == pytest.approx(max(4 * np.pi * blur_px**2, 1.0), rel=0.1)

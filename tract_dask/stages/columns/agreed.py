@@ -1,8 +1,8 @@
 """Second columns of blobs at the vector that the crystal's other blobs have.
 
 In a crystal of pairs the vector and the shape are known far better than any one blob tells. So a blob is a pair where
-two columns of the usual shape, about that vector apart, describe it as well as one column of any shape does, and where
-one column of the usual shape does not.
+two columns of the usual shape, about that vector apart, describe it as well as one column of any likely shape
+does, and where one column of the usual shape does not.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ _ALIKE, _ABOUT = 0.2, 0.45
 """By how much vectors differ, over their length, where they are alike; and where a blob may have the usual one."""
 _AS_WIDE = 1.1
 """By how much the sigmas of such columns differ from the usual ones."""
+_ANY = 1.5
+"""By how much the sigmas of one column in place of a pair differ from the usual ones: no atom is wider by more."""
 _PRESENT, _AGAINST = 25.0, 4.0
-"""What the second column has to explain, in units of the noise; and by how much one column of any shape may be better:
-as much as is likely of a blob among others that are pairs."""
+"""What the second column has to explain, in units of the noise; and by how much one column of another shape may be
+better: as much as is likely of a blob among others that are pairs."""
 
 
 class _Usual(NamedTuple):
@@ -136,8 +138,8 @@ def _as_the_others(
     start[..., [X, Y]] -= trial.corner[:, None]
     one = start.copy()
     one[..., [SIGMA_A, SIGMA_B, THETA]] = usual.shape[[SIGMA_A, SIGMA_B, THETA]]
-    sigmas = usual.shape[SIGMA_B] / _AS_WIDE, usual.shape[SIGMA_A] * _AS_WIDE
-    _, free = fitted(trial, start, *how)
+    sigmas, wide = ((usual.shape[SIGMA_B] / by, usual.shape[SIGMA_A] * by) for by in (_AS_WIDE, _ANY))
+    _, free = fitted(trial, start, *how, sigmas=wide)
     _, alone = fitted(trial, one, *how, sigmas=sigmas)
     best, left = np.repeat(one, 2, axis=1), np.full(len(one), np.inf)
     for by in (-usual.vector, -0.5 * usual.vector, 0 * usual.vector):

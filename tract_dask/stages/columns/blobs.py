@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 _SAME = 1.2
 """Columns nearer than so many sigmas are the same one, found twice."""
+_STAYS = 3.0
+"""A fit of a blob as one column ends within this share of the blobs' period, or it has left the blob."""
 
 
 def without_twins(fits: Fits, spacing: float) -> Floats:
@@ -35,7 +37,7 @@ def as_blobs(scene: Scene, settings: ColumnSettings, seeds: Seeds, fits: Fits, p
     """Return seeds and fits with one for those that touch, and are nearer than half the period of the blobs.
 
     Noise makes more than one maximum of a blob, and two columns may have one; the pixels tell which it is. What cannot
-    be fitted as one, at the rim of the image, stays as it was.
+    be fitted as one, such as at the rim of the image, stays as it was.
     """
     known = np.asarray(np.isfinite(fits.fit).all(axis=1))
     if not known.any():
@@ -48,7 +50,7 @@ def as_blobs(scene: Scene, settings: ColumnSettings, seeds: Seeds, fits: Fits, p
     blobs = np.array([fits.fit[number == number[k]][:, [X, Y]].mean(axis=0) for k in first])
     some = replace(seeds, places=blobs, kind=seeds.kind[first], number=seeds.number[first])
     one = fitted_alone(scene, settings, some, period, None, blur_sigma_px=fits.blur_sigma_px)
-    whole = np.isfinite(one.fit).all(axis=1)
+    whole = np.hypot(*(one.fit[:, [X, Y]] - blobs).T) < period / _STAYS
     kept = np.asarray(np.isin(number, number[first[whole]], invert=True))
     kept[first] = True
     at = first[whole]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ...kernels.gaussian.model import above_background
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ..groups import TOUCHING
+from .group_fits import correlations, shared
 from .trials import Floats, Mask, Trial, Tried
 
 NEAREST = 1.2
@@ -21,8 +22,8 @@ _EXPLAINED = 0.5
 _CLOSE, _FAINTEST, _FAINTEST_APART = 2.8, 0.2, 0.6
 """Sigmas up to which a column belongs to a blob, and its amplitude over that of the brightest: there, and beyond, where
 fainter ones are columns of another kind between them."""
-_LAGS, _NO_MORE = 4, 0.05
-"""Pixels over which noise may be correlated, and a correlation that is none."""
+_LAGS = 4
+"""Pixels over which noise may be correlated."""
 _FEWEST_FOR_NOISE = 8
 """Groups that tell how large the noise is."""
 
@@ -41,34 +42,20 @@ def noise_of(trials: list[Trial], tried: list[Tried], least: float, known: Noise
     """
     if known is not None and sum(len(trial.members) for trial in trials) < _FEWEST_FOR_NOISE:
         return known
-    left, shared, there = [], [], []
+    left, sharing, there = [], [], []
     for trial, one in zip(trials, tried, strict=True):
         number = trial.masks.sum(axis=(1, 2))
         left += (one.after / np.maximum(number - 4 * one.fits.shape[1], 1)).tolist()
         across, down = (np.arange(side) for side in trial.windows.shape[:0:-1])
-        for window, mask, group in zip(trial.windows, trial.masks, one.fits, strict=True):
-            columns = above_background(group, across, down[:, None]).sum(axis=0) * mask
-            residual = np.where(mask, window - columns - group[0, BACKGROUND], 0)
-            power = float((residual**2).sum())
-            seen = float((columns**2 * residual**2).sum() / max(float((columns**2).sum()), 1e-300))
-            shared.append([_correlations(residual, mask), _correlations(residual.T, mask.T)])
-            there.append(seen * mask.sum() / max(power, 1e-300))
+        columns = above_background(one.fits, across, down[:, None]).sum(axis=1) * trial.masks
+        residual = np.where(trial.masks, trial.windows - columns - one.fits[:, 0, BACKGROUND, None, None], 0)
+        sharing.append(correlations(residual, trial.masks, _LAGS))
+        power, weight = (np.maximum((values**2).sum(axis=(1, 2)), 1e-300) for values in (residual, columns))
+        there += ((columns**2 * residual**2).sum(axis=(1, 2)) / weight * number / power).tolist()
     if not left:
         return Noise(least**2, 1.0)
-    along = np.median(shared, axis=0)
-    along = np.where(np.minimum.accumulate(along, axis=1) > _NO_MORE, along, 0.0)  # up to where it has fallen to none
-    seen = float(np.prod(1 + 2 * along.sum(axis=1))) * max(1.0, float(np.median(there)))
+    seen = shared(np.median(np.concatenate(sharing), axis=0)) * max(1.0, float(np.median(there)))
     return Noise(max(least**2, float(np.median(left))), seen)
-
-
-def _correlations(residual: Floats, mask: Mask) -> list[float]:
-    """Return the correlations of pixels with those so many rows below."""
-    power = float((residual**2).sum()) / max(int(mask.sum()), 1)
-    found = []
-    for lag in range(1, _LAGS + 1):
-        both = int((mask[lag:] & mask[:-lag]).sum())
-        found.append(float((residual[lag:] * residual[:-lag]).sum()) / max(both * power, 1e-300))
-    return found
 
 
 def fallen(trial: Trial, tried: Tried, noise: Noise) -> Floats:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...kernels.gaussian.joint_shapes import ShapeFits, fit_shapes
 from ...kernels.gaussian.model import above_background
-from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, X, Y
+from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
 from ...kernels.windows import cut_windows
 from ...store.schema import Status
 
@@ -19,6 +19,10 @@ _SPREAD = 1.3
 """By how much the sigmas of members may differ from those of their common shape."""
 _CALLED_FOR = 3.0
 """By how much more than Schwarz's criterion asks shapes of their own have to make the squares of the residual fall."""
+_LAGS, _NO_MORE = 4, 0.05
+"""Pixels, beyond the blur, over which noise may be correlated, and a correlation that is none."""
+_FIT = 4.0
+"""Fits leave this share of the noise at least, however few pixels are independent."""
 _SIDES = 4
 _ROUNDS = 2
 
@@ -118,7 +122,7 @@ def _fit_class(
         windows[k] += above_background(own, x, y).sum(axis=0)
         disc = [np.hypot(x - px, y - py) <= window_px / 2 for px, py in np.rint(own[:, [X, Y]])]
         masks[k] = np.any(disc, axis=0) & image.known[top : top + rows, left : left + across]
-    fits = _best(windows, masks, start, image.sign)
+    fits = _best(windows, masks, start, image.sign, image.blur_sigma_px)
     estimates = fits.estimates.copy()
     estimates[..., [X, Y]] += corner[:, None]
     fit[members] = estimates
@@ -127,8 +131,35 @@ def _fit_class(
     status[members] = (status[members] & Status.OUTSIDE_FRAME) | flags.astype(np.uint8)
 
 
-def _best(windows: Floats, masks: NDArray[np.bool_], start: Floats, sign: int) -> ShapeFits:
+def shared_by_pixels(left: Floats, masks: NDArray[np.bool_], lags: int) -> float:
+    """Return by how much more than white noise of the same size a column sees of noise that pixels share.
+
+    ``left`` (n, rows, columns) is what fits leave of windows, 0 outside their masks; see :func:`correlations`.
+    """
+    return shared(np.median(correlations(left, masks, lags), axis=0))
+
+
+def correlations(left: Floats, masks: NDArray[np.bool_], lags: int) -> Floats:
+    """Return the correlations (n, 2, lags) of pixels with those so many rows, and columns, away."""
+    found = np.zeros((len(left), 2, lags))
+    for k, (residual, there) in enumerate(((left, masks), (left.transpose(0, 2, 1), masks.transpose(0, 2, 1)))):
+        power = (residual**2).sum(axis=(1, 2)) / np.maximum(there.sum(axis=(1, 2)), 1)
+        for lag in range(1, min(lags, residual.shape[1] - 1) + 1):
+            both = (there[:, lag:] & there[:, :-lag]).sum(axis=(1, 2))
+            products = (residual[:, lag:] * residual[:, :-lag]).sum(axis=(1, 2))
+            found[:, k, lag - 1] = products / np.maximum(both * power, 1e-300)
+    return found
+
+
+def shared(along: Floats) -> float:
+    """Return the sum of a noise's correlations (2, lags) over all pixels, up to where they have fallen to none."""
+    kept = np.where(np.minimum.accumulate(along, axis=1) > _NO_MORE, along, 0.0)
+    return float(np.prod(1 + 2 * kept.sum(axis=1)))
+
+
+def _best(windows: Floats, masks: NDArray[np.bool_], start: Floats, sign: int, blur_sigma_px: float) -> ShapeFits:
     """Return fits with one shape for all members, or with shapes of their own where these are called for."""
+    lags = _LAGS + round(3 * blur_sigma_px)
     members, side = start.shape[1], max(windows.shape[1:])
     lower, upper = start.copy(), start.copy()
     lower[..., AMPLITUDE], upper[..., AMPLITUDE] = (0, np.inf) if sign > 0 else (-np.inf, 0)
@@ -140,10 +171,14 @@ def _best(windows: Floats, masks: NDArray[np.bool_], start: Floats, sign: int) -
         return common
     shape = common.estimates[..., [SIGMA_A, SIGMA_B]]
     lower[..., [SIGMA_A, SIGMA_B]], upper[..., [SIGMA_A, SIGMA_B]] = shape / _SPREAD, shape * _SPREAD
+    along = np.arange(windows.shape[2]), np.arange(windows.shape[1])[:, None]
+    shown = above_background(common.estimates, *along).sum(axis=1) + common.estimates[:, 0, BACKGROUND, None, None]
+    left = np.where(masks, windows - shown, 0.0)
     own = fit_shapes(windows, masks, common.estimates, lower, upper, shape="own", max_iterations=60)
     number = masks.sum(axis=(1, 2))
-    variance = own.squares / np.maximum(number - 6 * members - 1, 1)
-    asked = 3 * (members - 1) * np.log(np.maximum(number, 2)) + _CALLED_FOR
+    times = shared_by_pixels(left, masks, lags)
+    variance = own.squares / np.maximum(number - times * (6 * members + 1), number / _FIT)
+    asked = (3 * (members - 1) * np.log(np.maximum(number, 2)) + _CALLED_FOR) * times
     found = own.estimates[..., [SIGMA_A, SIGMA_B]]
     edge = (found[..., 0] >= upper[..., SIGMA_A] * 0.999) | (found[..., 1] <= lower[..., SIGMA_B] * 1.001)
     better = own.converged & ~edge.any(axis=1) & (common.squares - own.squares > asked * np.maximum(variance, 1e-300))
