@@ -12,7 +12,7 @@ from tract_dask.kernels.gaussian.model import blurred, evaluate
 from tract_dask.kernels.windows import blur, blur_variance
 from tract_dask.settings import FitSettings
 from tract_dask.stages.fit.noise_size import window_noise
-from tract_dask.stages.fit.shape_error import shape_errors
+from tract_dask.stages.fit.shape_error import _errors, shape_errors
 
 PULL = 0.08
 """Errors of means over the frames, in units of the stated ones, have a root mean square this near to 1; 600 columns."""
@@ -70,7 +70,7 @@ def test_means_over_frames_are_as_far_from_the_truth_as_is_stated(drawn, setting
     volume = 2 * np.pi * (fits.estimates[:, 0] * fits.estimates[:, 3] * fits.estimates[:, 4]).reshape(COLUMNS, FRAMES)
     of_one = np.sqrt((fits.volume_stderr**2).reshape(COLUMNS, FRAMES).mean(axis=1))
     of_one *= window_noise(shape, SIDE, fit).volume
-    shared = shape_errors(shape, SIDE, (), fit, SUMMED_BLUR) / np.sqrt(FRAMES)
+    shared = shape_errors(shape, SIDE, (), fit, SUMMED_BLUR).intensity / np.sqrt(FRAMES)
     error = volume.mean(axis=1) - 2 * np.pi * truth[0, 0] * truth[0, 3] * truth[0, 4]
     stated = of_one * np.sqrt(1 / FRAMES + shared**2)
     assert np.sqrt(((error / stated) ** 2).mean()) == pytest.approx(1, abs=PULL)
@@ -95,3 +95,19 @@ def test_tracks_state_it_and_means_carry_it(tmp_path, npy):
     mean = mean_intensity(fixed)
     stated = np.sqrt((fixed["intensity_stderr"] ** 2).mean("frame"))
     np.testing.assert_allclose(mean["shape_stderr"].isel(frame=0), shared * stated)
+
+
+def test_the_place_of_a_column_alone_does_not_depend_on_its_shape_and_that_of_touching_ones_does():
+    """Along the line between two columns, and more the nearer they are; across it far less."""
+    fit, blurs, inside = FitSettings(blur_sigma_px=1.0), (1.0, 1.0), np.ones((25, 37), bool)
+    alone = np.array([[60.0, 18.0, 12.0, 2.8, 2.8, 0.0, 20.0]])
+    assert np.abs(_errors(alone, inside, blurs, fit, None)[1:]).max() < 1e-3
+    shared = []
+    for apart in (5.6, 7.0, 8.4):
+        pair = np.repeat(alone, 2, axis=0)
+        pair[:, 1] += [-apart / 2, apart / 2 + 0.01]
+        pair[1, 3:5] *= 1.02
+        shared.append(_errors(pair, inside, blurs, fit, None)[1:].max(axis=1))
+    along, across = np.array(shared).T
+    assert (np.diff(along) < 0).all()
+    assert (across < 0.3 * along).all()

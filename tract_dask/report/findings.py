@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
@@ -18,7 +19,7 @@ from .camera import camera_findings, faint_words, fine_columns, free_words, patt
 from .crystal import hop_words, left_out_words, motion_words, same_atom_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
-from .touching import alone_words, half_words, unresolved_words
+from .touching import alone_words, half_words, shared_words, unresolved_words
 
 LOW_SHARE = 0.9
 """Fewer accepted fits than this share of all that were made are worth a warning."""
@@ -43,6 +44,8 @@ it."""
 UNLIKE, UNLIKE_OTHERS = 0.1, 5.0
 """A column is not one Gaussian where a larger share of its fits is unlike one, and larger by this factor than usual:
 noise that is not as the fit takes it is so in all columns."""
+LONG = 2.0
+"""A column that is longer than the median one by this factor is more than one."""
 BY_CHANCE = 0.01
 """Probability that chance names a column in a movie in which all are one Gaussian."""
 RIVAL = 0.5
@@ -233,11 +236,13 @@ def _columns(run: Survey) -> Iterator[Finding]:
         yield Finding("at_the_edge", "Columns near the edge are missing at times", text, remedy, serious=False)
     poor = (columns["residual"].to_numpy() > RESIDUAL) & ~(columns["p_value"].to_numpy() > BY_CHANCE / len(ids))
     unlike = _unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy())
-    if (poor | unlike).any():
+    long = _long(run.tracks)
+    if (poor | unlike | long).any():
         seen = {
             f"the fit on the summed image leaves more than {RESIDUAL:.0%} of the amplitude (rms), more than noise does,"
             f" for {_of_columns(ids[poor])}": poor,
             f"more than {UNLIKE:.0%} of the fits leave far more than noise for {_of_columns(ids[unlike])}": unlike,
+            f"the summed image shows them more than {LONG:g} times as long as others: {_of_columns(ids[long])}": long,
         }
         text = "; ".join(words for words, which in seen.items() if which.any())
         text = f"{text[:1].upper()}{text[1:]}. A neighbour reaches into the window, or the column is not a Gaussian."
@@ -254,6 +259,13 @@ def _unlike_one(number: NDArray[np.int64], accepted: NDArray[np.int64]) -> NDArr
     usual = float(np.median(share))
     chance = bdtrc(number - 1, accepted, min(UNLIKELY + usual, 1.0))
     return np.asarray((share > UNLIKE) & (share > UNLIKE_OTHERS * usual) & (chance < BY_CHANCE / len(number)))
+
+
+def _long(tracks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return which columns, fitted alone, are far longer than usual: another column is half in their windows."""
+    sigma = tracks["fit_ref"].sel(parameter=["sigma_a", "sigma_b"]).to_numpy().max(axis=1)
+    alone = tracks["group"].to_numpy() == 0 if "group" in tracks else np.ones(len(sigma), np.bool_)
+    return np.asarray(alone & (sigma > LONG * np.nanmedian(sigma))) if np.isfinite(sigma).any() else alone & False
 
 
 def _of_columns(ids: NDArray[np.int64]) -> str:
@@ -407,6 +419,8 @@ def _crystal(run: Survey) -> Iterator[Finding]:
         yield Finding("touching_alone", **words)
     if words := half_words(run):
         yield Finding("one_of_two", **words)
+    if words := shared_words(run):
+        yield Finding("shared_error", **words)
     if words := unresolved_words(run):
         yield Finding("unresolved", **words)
 

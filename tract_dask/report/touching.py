@@ -11,6 +11,9 @@ from ..stages.groups import UNRESOLVED, groups_of, touching
 from .finding import count, named
 from .survey import Survey
 
+SHARED = 1.0
+"""Error that all frames share, over that of a mean over frames, from which it is told."""
+
 
 def alone_words(run: Survey) -> dict[str, Any] | None:
     """Return what there is to say of touching columns that were fitted each alone; None where none was."""
@@ -60,6 +63,29 @@ def unresolved_words(run: Survey) -> dict[str, Any] | None:
         )
     remedy = "Sum frames (rebin_frames) to see both, or keep one column of each pair in columns.csv, for both."
     return {"title": "Pairs of columns are not resolved in single frames", "text": text.strip(), "remedy": remedy}
+
+
+def shared_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of places that err alike in all frames; None where means hardly feel it.
+
+    A frame's error s leaves s / sqrt(n) to a mean of n frames, and what is shared, a times s, stays.
+    """
+    share = run.about.get("shared_place_error") or 0.0
+    ids = run.tracks["column_id"].to_numpy()
+    together = run.tracks["group"].to_numpy() > 0 if "group" in run.tracks else np.zeros(len(ids), np.bool_)
+    number = run.columns["accepted"].to_numpy()[together]
+    if not number.size or share * np.sqrt(np.median(number)) <= SHARED:
+        return None
+    usual = float(np.nanmedian(run.columns["expected"].to_numpy()[together]))
+    of_mean = np.sqrt(1 + share**2 * np.median(number))
+    text = (
+        f"{count(len(number), 'column')} touch a neighbour, and their positions depend on the widths that the summed "
+        f"image gave them: {share * usual:.2g} {run.known.unit} of error (rms) is the same in all frames. Stated "
+        f"errors leave it out: that of one frame is too small by a factor of {np.hypot(1, share):.2f}, that of a mean "
+        f"over all by {of_mean:.1f}."
+    )
+    remedy = "Changes from frame to frame are free of it. Count it in distances between these columns."
+    return {"title": "Touching columns err alike in all frames", "text": text, "remedy": remedy}
 
 
 def _fitted_as_one(run: Survey) -> list[int]:

@@ -44,6 +44,7 @@ EXPLAINS: dict[str, frozenset[str]] = {
         "lost_frames": "absent",
         "scatter": "pull",
         "touching_alone": "bias pull intensity",
+        "shared_error": "bias pull",
         "unresolved": "missing false bias pull intensity",
         "long_step": "bias pull",
         "poor_drift": "bias pull",

@@ -36,7 +36,7 @@ from .groups import Groups, plan_groups
 from .noise_size import WindowNoise, window_noise
 from .row_homes import check_frames, sites_of
 from .same_atom import Pairs
-from .shape_error import shape_errors
+from .shape_error import ShapeErrors, shape_errors
 from .vacuum import check_box, find_vacuum, why_unusable
 
 
@@ -111,6 +111,7 @@ class Job:
             correlation=self.correlation,
             threshold_scale=self.scale,
             residual_share=self.left_over,
+            shared_place_error=self.shared_place_error,
             lost=list(self.lost),
             motion_centre=self.centre.tolist(),
         )
@@ -292,15 +293,28 @@ class Job:
         return plan_groups(self.group_numbers, self.reference, self.window_px, self.settings, shared, self.frame)
 
     @cached_property
-    def shape_error(self) -> xr.Variable:
-        """Error of the intensity that all frames share, over a frame's own, (columns,); :data:`schema.SHAPE_ERROR`."""
+    def shape_errors(self) -> ShapeErrors:
+        """Errors that all frames share, by the columns' shapes in the summed image, over a frame's own."""
         shared = None if self.correlation is None else np.array(self.correlation)
         of_one = shape_errors(
             self.reference, self.window_px, self.groups, self.settings, self.reference_blur_px, shared
         )
-        frames = np.full(len(of_one), np.nan) if self.summed is None else self.summed
+        frames = np.full(len(of_one.place), np.nan) if self.summed is None else self.summed
+        less = np.sqrt(np.maximum(frames, 1))
+        return ShapeErrors(of_one.intensity / less, of_one.place / less[:, None])
+
+    @cached_property
+    def shape_error(self) -> xr.Variable:
+        """That of the intensity, (columns,); :data:`schema.SHAPE_ERROR`."""
         kind = schema.SHAPE_ERROR
-        return xr.Variable(kind.dims, of_one / np.sqrt(np.maximum(frames, 1)), kind.attributes)
+        return xr.Variable(kind.dims, self.shape_errors.intensity, kind.attributes)
+
+    @property
+    def shared_place_error(self) -> float | None:
+        """Root mean square over touching columns of that of a coordinate; None where none touch, or it is not known."""
+        of_touching = self.shape_errors.place[self.group_numbers > 0]
+        known = of_touching[np.isfinite(of_touching)]
+        return float(np.sqrt(np.square(known).mean())) if known.size else None
 
     @cached_property
     def in_units(self) -> Job:

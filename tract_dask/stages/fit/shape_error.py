@@ -1,9 +1,12 @@
-"""What intensities of all frames have in common: the error of the shape that was taken from the summed image.
+"""What fits of all frames have in common: the error of the shape that was taken from the summed image.
 
 With its shape held, a column's volume V goes wrong by g dS where its covariances S = (xx, xy, yy) are off by dS. A
 volume estimate of frames is a sum of raw pixels with the weights v, and dS one of the pixels of the summed image with
 the weights s. So the mean over all frames errs as v + g s, and of that only v becomes smaller with frames that are
 independent. Both are written for one frame's noise; of N frames that were summed, s has 1 / N of the variance.
+
+So do places of columns that touch: one that is held too wide pushes its neighbour away. A column that is fitted alone
+is even about its middle, and its place does not depend on its shape.
 
 By volume and covariances, a column that is blurred is the same with the blur's variance added to xx and yy.
 """
@@ -11,6 +14,7 @@ By volume and covariances, a column that is blurred is the same with the blur's 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +34,13 @@ _MODELS = 16
 """So many groups of one size tell what shapes do to the others."""
 
 
+class ShapeErrors(NamedTuple):
+    """Errors that all frames share, over a frame's own: of intensities (columns,), and of places (columns, 2)."""
+
+    intensity: Floats
+    place: Floats
+
+
 def shape_errors(
     reference: Floats,
     window_px: int,
@@ -37,10 +48,10 @@ def shape_errors(
     settings: FitSettings,
     reference_blur_px: float,
     correlation: Floats | None = None,
-) -> Floats:
-    """Return the error of the intensity that the shape of one summed frame makes, over a frame's own, (columns,).
+) -> ShapeErrors:
+    """Return the errors that the shape of one summed frame makes, over a frame's own.
 
-    Of N summed frames it is smaller by sqrt(N). Zero where shapes are free.
+    Of N summed frames they are smaller by sqrt(N). Zero where shapes are free.
 
     Parameters
     ----------
@@ -55,33 +66,36 @@ def shape_errors(
     correlation
         (2 r + 1, 2 r + 1) autocorrelation of the raw pixels' noise; None: they share none.
     """
+    place = np.zeros((len(reference), 2))
     if settings.shape == "free":
-        return np.zeros(len(reference))
+        return ShapeErrors(place[:, 0], place)
     blurs = reference_blur_px, settings.window_blur_px
     first, which = alike(reference)
     middle = window_px // 2
     some = reference[first]
     some[:, [X, Y]] = middle
-    found = np.array([_error(column[None], disc(window_px), blurs, settings, correlation)[0] for column in some])[which]
+    found = np.array([_errors(column[None], disc(window_px), blurs, settings, correlation)[0, 0] for column in some])[
+        which
+    ]
     together = joint_settings(settings)
     for of_size in groups:
         own = reference[of_size.members]
         own[..., [Y, X]] += np.array(of_size.size) // 2 - of_size.centre[:, None]
         chosen = np.unique(np.linspace(0, len(own) - 1, _MODELS).round().astype(int))
-        found[of_size.members] = math.sqrt(
-            np.mean([_error(own[k], of_size.masks[k], blurs, together, correlation) ** 2 for k in chosen])
-        )
-    return found
+        errors = np.stack([_errors(own[k], of_size.masks[k], blurs, together, correlation) for k in chosen])
+        found[of_size.members], *along = np.sqrt(np.square(errors).mean(axis=(0, 2)))
+        place[of_size.members] = along
+    return ShapeErrors(found, place)
 
 
-def _error(
+def _errors(
     columns: Floats,
     mask: NDArray[np.bool_],
     blurs: tuple[float, float],
     settings: FitSettings,
     correlation: Floats | None,
 ) -> Floats:
-    """Return the errors (members,) of columns (members, 7) that are fitted together to the pixels of a mask."""
+    """Return errors (3, members) of volumes, x and y of columns (members, 7) that are fitted together to a mask."""
     margin = max(gaussian_kernel(blur).size for blur in blurs) // 2
     columns = columns.copy()
     columns[:, [AMPLITUDE, BACKGROUND]] /= np.abs(columns[:, AMPLITUDE]).max() or 1.0  # slopes are of about one size
@@ -98,12 +112,12 @@ def _error(
     of_shapes = np.linalg.pinv(summed @ summed.T)[3 * n + 1 :] @ summed
     fitted, shaped = fitted[: 3 * n + 1], shaped[3 * n + 1 :]
     weighted = fitted * weights if settings.estimator == "poisson" else fitted
-    of_volumes = (np.linalg.pinv(weighted @ fitted.T) @ weighted)[:n]
-    wrong = of_volumes @ shaped.T
-    own = _on_raw_pixels(of_volumes, mask, blurs[1], margin)
+    estimates = (np.linalg.pinv(weighted @ fitted.T) @ weighted)[: 3 * n]
+    wrong = estimates @ shaped.T
+    own = _on_raw_pixels(estimates, mask, blurs[1], margin)
     both = own - np.einsum("vs,syx->vyx", wrong, _on_raw_pixels(of_shapes, mask, blurs[0], margin))
     alone, together = (_variances(images * np.sqrt(variance), correlation) for images in (own, both))
-    return np.asarray(np.sqrt(np.maximum(together / alone - 1, 0)))
+    return np.sqrt(np.maximum(together / alone - 1, 0)).reshape(3, n)
 
 
 def _slopes(columns: Floats, mask: NDArray[np.bool_], blur: float) -> Floats:
