@@ -110,6 +110,18 @@ def test_what_the_fork_server_imports_starts_no_thread():
         assert len(list(Path(f"/proc/{server}/task").iterdir())) == 1
 
 
+def test_what_a_killed_process_leaves_is_removed_without_a_word():
+    code = """
+import multiprocessing, os
+from tract_dask.cluster.forkserver import start_tracker
+start_tracker()
+held = multiprocessing.get_context("spawn").Semaphore()
+os._exit(0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_workers_are_spawned_where_there_is_no_fork_server(monkeypatch):
     monkeypatch.setattr(forkserver, "AVAILABLE", False)
     with cluster.connect(ClusterSettings(workers=1)) as client:

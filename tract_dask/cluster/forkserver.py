@@ -45,6 +45,8 @@ should not be forked.
 Dask's own limit for that, 64 KiB, makes the system clear the pages of every buffer anew: as much work as decoding.
 """
 
+_QUIET = "ignore:resource_tracker:UserWarning"
+
 _PRELOAD = ["tract_dask.run.worker_imports"]
 
 
@@ -56,9 +58,18 @@ def start() -> None:
     """
     if AVAILABLE:
         multiprocessing.set_forkserver_preload(_PRELOAD)
-        resource_tracker.ensure_running()  # which the server would start, and which hears nothing by itself
+        start_tracker()  # which the server would start, and which hears nothing by itself
         with _environment(), _deaf():
             forkserver.ensure_running()
+
+
+def start_tracker() -> None:
+    """Start the process that removes what killed workers leave in shared memory, and let it do so without a word."""
+    sys.warnoptions.append(_QUIET)  # handed on to the process
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(_QUIET)
 
 
 @contextmanager
