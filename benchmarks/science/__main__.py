@@ -7,12 +7,13 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from . import filters, jumps, levels, occupancy, pairs, precision, scale
+from . import filters, jumps, levels, moves, occupancy, pairs, precision, scale
 from .tables import Table, markdown, publish
 
 SECTIONS: dict[str, Callable[[Path, Path], list[Table]]] = {
     "precision": precision.run,
     "pairs": pairs.run,
+    "moves": moves.run,
     "jumps": jumps.run,
     "levels": levels.run,
     "occupancy": occupancy.run,

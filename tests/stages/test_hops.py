@@ -6,6 +6,7 @@ import xarray as xr
 from conftest import Scene
 
 from tract_dask import convert, fit_columns, open_movie
+from tract_dask.analysis.jumps import change_points
 from tract_dask.settings import ConvertSettings, FitSettings
 from tract_dask.store.schema import Status, is_accepted
 
@@ -53,6 +54,8 @@ def test_a_column_that_hops_is_followed(npy, tmp_path, by, settings):
     assert np.abs(away[3:, HOPPER]).max() < 5
     assert 0.7 < away[3:, HOPPER].std() < 1.5  # ten numbers
     assert np.nanmin(tracks["presence"].to_numpy()[3:, HOPPER]) > 5
+    found = change_points(tracks.assign_attrs(pixel_size_pm=10.0), 0.99)
+    assert list(zip(found["frame"].values, found["column_id"].values - 1, strict=True)) == [(3, HOPPER)]
 
 
 def test_dark_columns_hop_as_well(npy, tmp_path):

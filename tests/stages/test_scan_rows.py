@@ -1,6 +1,7 @@
 """Displaced rows of scanned movies, from the pixels to the tracks."""
 
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from conftest import Scene
 from tract_dask import convert, fit_columns, open_movie, open_results
 from tract_dask.analysis.motion import places_in_frames
 from tract_dask.errors import SettingsError
+from tract_dask.report.crystal import row_words
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
 from tract_dask.stages.fit.job import prepare
 from tract_dask.stages.fit.row_homes import on_sites, sites_of
@@ -87,6 +89,13 @@ def test_offsets_of_rows_are_found(scanned, fitted):
     assert told.mean() > 0.3
     assert error[told].std() < 0.4 * JITTER_PX
     assert (error / stated)[told].std() == pytest.approx(1, abs=0.2)
+
+
+def test_a_report_says_how_far_rows_were_displaced(fitted):
+    words = row_words(SimpleNamespace(tracks=fitted(scan_rows="sum").chunk()))
+    assert "displaced along x by 1" in words["text"]
+    assert not words["remedy"]
+    assert row_words(SimpleNamespace(tracks=fitted())) is None
 
 
 def test_a_lattice_says_where_columns_belong(scanned, fitted):

@@ -94,6 +94,23 @@ def same_atom_words(run: Survey) -> dict[str, Any] | None:
     return {"title": "Columns share an atom", "text": text, "remedy": remedy}
 
 
+def row_words(run: Survey) -> dict[str, Any] | None:
+    """Return what there is to say of displaced rows that positions are freed from; None where none was looked for."""
+    if "row_offset" not in run.tracks:
+        return None
+    offset, error, shift = (
+        float((run.tracks[name] ** 2).mean().compute()) for name in ("row_offset", "row_offset_stderr", "row_shift")
+    )
+    places = float((run.tracks["stderr"].sel(parameter="x") ** 2).mean().compute())
+    text = (
+        f"Rows of the frames were displaced along x by {np.sqrt(offset + error):.2g} px (rms), and columns with them by "
+        f"{np.sqrt(shift):.2g} px. x is freed from that (row_offset and row_shift in the results)."
+    )
+    few = not shift > places
+    remedy = "That is less than the errors of places: leave out --scan-rows." if few else ""
+    return {"title": "Offsets of scanned rows were undone", "text": text, "remedy": remedy, "serious": False}
+
+
 def motion_words(run: Survey) -> dict[str, Any] | None:
     """Return what there is to say of a crystal that turned, grew or sheared; None where none did."""
     undone = run.about.get("motions_undone")

@@ -16,7 +16,7 @@ from ..store.pixels import KINDS
 from ..store.schema import AXES, Status
 from ..store.strangers import advice
 from .camera import camera_findings, faint_words, fine_columns, free_words, pattern_words
-from .crystal import hop_words, left_out_words, motion_words, same_atom_words, slip_words
+from .crystal import hop_words, left_out_words, motion_words, row_words, same_atom_words, slip_words
 from .finding import Finding, count, named
 from .survey import Survey
 from .touching import alone_words, half_words, shared_words, unresolved_words
@@ -409,6 +409,8 @@ def _crystal(run: Survey) -> Iterator[Finding]:
         yield Finding("left_out", **words)
     if words := motion_words(run):
         yield Finding("crystal_motion", **words)
+    if words := row_words(run):
+        yield Finding("scan_rows", **words)
     if words := slip_words(run):
         yield Finding("moving_columns", **words)
     if words := hop_words(run):

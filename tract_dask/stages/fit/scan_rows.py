@@ -13,6 +13,7 @@ from ...kernels.gaussian.parameters import SIGMA_A, SIGMA_B, X, Y
 from ...kernels.scan_rows import displaced_rows
 from ...kernels.windows import Tiles, blur_variance, cut_windows
 from ...store.schema import is_accepted
+from ..columns.window_size import neighbour_distance
 from .frame_fits import FrameFits
 from .job import Job
 from .places import Places
@@ -20,6 +21,10 @@ from .row_homes import on_sites
 
 Floats = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]
+
+
+_TELLING = 3.0
+"""Pixels so many sigmas from a column tell of its rows, but for those that are as near to another one."""
 
 
 def undone(
@@ -45,14 +50,14 @@ def undone(
     offset, stderr = np.full((2, n_frames, height), np.nan)
     estimates, errors, centroid = fits.estimates.copy(), fits.stderr.copy(), fits.centroid.copy()
     shift, zero = np.zeros((n_frames, n_columns)), np.zeros((1, 1), np.int64)
-    blur = blur_variance(job.settings.window_blur_px)
+    blur, size = blur_variance(job.settings.window_blur_px), _size(job)
     for k in np.flatnonzero(~(places.bad | places.lost)).tolist():
         image = cut_windows(tiles, zero, zero, (height, width), 0.0, gain, k)[0, 0].astype(np.float64) - job.floor
         seen = np.where(is_accepted(status[k])[:, None], fits.estimates[k], np.nan)
         sites = job.row_sites
         home = _home(seen, places, k, job) if sites is None else on_sites(seen[:, X], sites)
         raw, counting = blurred(seen, -blur), job.settings.counting
-        found = displaced_rows(image, raw, home, job.window_px, counting=counting)
+        found = displaced_rows(image, raw, home, size, counting=counting)
         offset[k], stderr[k] = found.offset, np.sqrt(found.variance)
         known = np.isfinite(found.x)
         shift[k, known] = (seen[:, X] - found.x)[known]
@@ -77,6 +82,13 @@ def free_hopped(fits: FrameFits, hopped: NDArray[np.bool_], rows: Values, job: J
         fits.stderr[frame, column, X] = np.hypot(
             fits.stderr[frame, column, X], np.sqrt((share * stderr) @ (share * stderr))
         )
+
+
+def _size(job: Job) -> int:
+    """Return the diameter of what tells of rows: windows of fits are narrow for columns that are cut into rows."""
+    sigma = float(np.median(job.reference[:, SIGMA_A]))
+    distance = neighbour_distance(job.reference[:, [X, Y]]) if len(job.reference) > 1 else 0.0
+    return max(job.window_px, 2 * int(min(_TELLING * sigma, (distance or 0.0) / 2)) + 1)
 
 
 def _home(seen: Floats, places: Places, frame: int, job: Job) -> Floats:
