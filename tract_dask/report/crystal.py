@@ -103,7 +103,7 @@ def row_words(run: Survey) -> dict[str, Any] | None:
     )
     places = float((run.tracks["stderr"].sel(parameter="x") ** 2).mean().compute())
     text = (
-        f"Rows of the frames were displaced along x by {np.sqrt(offset + error):.2g} px (rms), and columns with them by "
+        f"Rows of the frames were displaced along x by {np.sqrt(offset + error):.2g} px (rms), and columns by "
         f"{np.sqrt(shift):.2g} px. x is freed from that (row_offset and row_shift in the results)."
     )
     few = not shift > places

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]
 
 
-_TELLING = 3.0
+_TELLING = 2.5
 """Pixels so many sigmas from a column tell of its rows, but for those that are as near to another one."""
 
 
