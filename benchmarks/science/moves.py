@@ -166,14 +166,14 @@ def told(columns: Floats, offset: Floats) -> Floats:
     return np.asarray((slope**2 / (BACKGROUND + image)).sum(axis=1)) + 1e-12
 
 
-def fitted(movie: Movie, folder: Path, **settings: str) -> xr.Dataset:
+def fitted(movie: Movie, folder: Path, scan_rows: str = "off") -> xr.Dataset:
     """Return the tracks of given columns, in memory."""
     folder.mkdir()
     np.save(folder / "movie.npy", movie.counts)
     opened = open_movie(convert(folder / "movie.npy", folder / "movie.zarr"))
     places, number = movie.columns[:, 1:3], np.arange(1, len(movie.columns) + 1)
     columns = column_dataset(places, [""] * len(places), number, movie.columns).assign_attrs(blur_sigma_px=0.0)
-    tracks = fit_columns(opened, columns, settings=FitSettings(refine_drift=False, **settings))
+    tracks = fit_columns(opened, columns, settings=FitSettings(refine_drift=False, scan_rows=scan_rows))
     return tracks.compute().assign_attrs(pixel_size_pm=PIXEL_PM)
 
 
