@@ -1,5 +1,6 @@
 """What warnings advise helps: scenes with known truth that trigger each, and do not once the remedy is taken."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -54,6 +55,18 @@ def test_sums_of_frames_are_not_faint_and_are_accepted(dim):
     for name in ("faint", "accepted"):
         assert "rebin_frames" in single[name].remedy
         assert name not in summed
+
+
+def test_the_wider_window_that_is_named_accepts_more(dim):
+    default = told(dim, window_px=13)["accepted"]
+    window = int(re.findall(r"--window-px (\d+)", default.remedy)[0])
+    assert 13 < window <= 21
+    wide = told(dim, window_px=window)
+    assert "accepted" not in wide or share_of(wide["accepted"]) > share_of(default) + 0.02
+
+
+def share_of(accepted):
+    return float(re.findall(r"\(([\d.]+)%\)", accepted.text)[0]) / 100
 
 
 def test_fixed_shapes_are_determined(dim):

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import bdtrc
 
-from ..analysis.overview import UNLIKELY
 from ..settings.run import FitSettings
 from ..store.camera import ATTRIBUTE, Camera
 from ..store.pixels import KINDS
@@ -18,11 +15,14 @@ from ..store.strangers import advice
 from .camera import camera_findings, faint_words, fine_columns, free_words, pattern_words
 from .crystal import hop_words, left_out_words, motion_words, row_words, same_atom_words, slip_words
 from .finding import Finding, count, named
+from .odd import BY_CHANCE, LONG, UNLIKE, far_longer, unlike_one
 from .survey import Survey
 from .touching import alone_words, half_words, shared_words, unresolved_words
 
 LOW_SHARE = 0.9
 """Fewer accepted fits than this share of all that were made are worth a warning."""
+WIDE, CLEAR = 0.7, 4.0
+"""Diameter of the widest window that is advised, in distances of columns; sigmas between its edge and neighbours."""
 HALF = 0.5
 """A column, or a frame, with a smaller share of accepted fits is named."""
 AT_BOUND = 0.02
@@ -41,13 +41,6 @@ POOR_QUALITY = 0.5
 RESIDUAL = 0.15
 """Residual of a fit on the summed image, as a share of the amplitude, that is worth a look where noise does not explain
 it."""
-UNLIKE, UNLIKE_OTHERS = 0.1, 5.0
-"""A column is not one Gaussian where a larger share of its fits is unlike one, and larger by this factor than usual:
-noise that is not as the fit takes it is so in all columns."""
-LONG = 2.0
-"""A column that is longer than the median one by this factor is more than one."""
-BY_CHANCE = 0.01
-"""Probability that chance names a column in a movie in which all are one Gaussian."""
 RIVAL = 0.5
 """Share of the support for one contrast that the other one may have."""
 DOUBTFUL, MANY_DOUBTFUL = 0.2, 0.5
@@ -213,14 +206,31 @@ def _acceptance(run: Survey) -> Iterator[Finding]:
         f"against one: {reason} ({numbers[reason]:,} fits)."
     )
     remedy = "Look at which columns and frames they are, below; sum frames (rebin_frames) where the dose is too low."
+    if reason == next(iter(reasons)) and (window := _wider(run)):
+        remedy += f" Where nothing else lies between the columns, --window-px {window} tells amplitudes better."
     yield Finding("accepted", "Few fits were accepted", text, remedy)
+
+
+def _wider(run: Survey) -> int | None:
+    """Return the diameter of a window that tells amplitudes better and keeps neighbours out; None where there is none.
+
+    An amplitude is known against its background, and a window of a few sigmas sees little of that.
+    """
+    apart, sigma = _spacing(run), float(np.nanmedian(run.tracks["fit_ref"].sel(parameter="sigma_a")))
+    if not apart or not np.isfinite(sigma):
+        return None
+    widest = 2 * int(min(WIDE * apart, 2 * (apart - CLEAR * sigma)) / 2) - 1
+    return widest if widest > run.tracks.attrs["window_px"] else None
 
 
 def _columns(run: Survey) -> Iterator[Finding]:
     columns, ids = run.columns, run.columns["column_id"].to_numpy()
     weak = columns["share"].to_numpy() < HALF
     if weak.any():
-        text = f"Fewer than half of the fits were accepted for {_of_columns(ids[weak])}."
+        text = (
+            f"Fewer than half of the fits were accepted for {_of_columns(ids[weak])}. Means over accepted fits of a "
+            "faint column are too large: those pass in which noise adds to it."
+        )
         remedy = "Is there a column in the summed image? If not, remove it from columns.csv and run again."
         yield Finding("weak_columns", "Some columns are seldom there, or too weak", text, remedy)
     n_frames = run.frames.sizes["frame"]
@@ -235,8 +245,8 @@ def _columns(run: Survey) -> Iterator[Finding]:
         remedy = "Nothing is wrong. A smaller window (--window-px) reaches closer to the edge."
         yield Finding("at_the_edge", "Columns near the edge are missing at times", text, remedy, serious=False)
     poor = (columns["residual"].to_numpy() > RESIDUAL) & ~(columns["p_value"].to_numpy() > BY_CHANCE / len(ids))
-    unlike = _unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy())
-    long = _long(run.tracks)
+    unlike = unlike_one(columns["unlike"].to_numpy(), columns["accepted"].to_numpy())
+    long = far_longer(run.tracks)
     if (poor | unlike | long).any():
         seen = {
             f"the fit on the summed image leaves more than {RESIDUAL:.0%} of the amplitude (rms), more than noise does,"
@@ -251,21 +261,6 @@ def _columns(run: Survey) -> Iterator[Finding]:
             "missing to columns.csv, and run again."
         )
         yield Finding("one_gaussian", "One Gaussian is not enough for some columns", text, remedy)
-
-
-def _unlike_one(number: NDArray[np.int64], accepted: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which columns have too many fits that are unlike one Gaussian: more than chance has in any of them."""
-    share = number / np.maximum(accepted, 1)
-    usual = float(np.median(share))
-    chance = bdtrc(number - 1, accepted, min(UNLIKELY + usual, 1.0))
-    return np.asarray((share > UNLIKE) & (share > UNLIKE_OTHERS * usual) & (chance < BY_CHANCE / len(number)))
-
-
-def _long(tracks: xr.Dataset) -> NDArray[np.bool_]:
-    """Return which columns, fitted alone, are far longer than usual: another column is half in their windows."""
-    sigma = tracks["fit_ref"].sel(parameter=["sigma_a", "sigma_b"]).to_numpy().max(axis=1)
-    alone = tracks["group"].to_numpy() == 0 if "group" in tracks else np.ones(len(sigma), np.bool_)
-    return np.asarray(alone & (sigma > LONG * np.nanmedian(sigma))) if np.isfinite(sigma).any() else alone & False
 
 
 def _of_columns(ids: NDArray[np.int64]) -> str:

@@ -38,7 +38,7 @@ EXPLAINS: dict[str, frozenset[str]] = {
         "doubtful_columns": "missing false",
         "spacing": "missing false",
         "undersampled": "missing bias pull intensity",
-        "weak_columns": "missing false absent",
+        "weak_columns": "missing false absent intensity",
         "one_gaussian": "missing false bias pull intensity",
         "faint": "pull intensity",
         "lost_frames": "absent",
