@@ -558,6 +558,8 @@ BESIDE = {
         "damaged",
         "writes the file again",
     ),
+    "run.toml empty": ("run.toml", lambda data: b"", "damaged", "writes the file again"),
+    "run.toml cut": ("run.toml", lambda data: data[: data.index(b"[fit]")], "damaged", "writes the file again"),
     "run.toml gone": ("run.toml", None, "missing", "writes the file again"),
     "a setting unknown": (
         "run.toml",

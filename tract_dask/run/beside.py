@@ -7,7 +7,7 @@ import json
 import os
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -109,8 +109,10 @@ def _fault(file: Path, error: Exception, remedy: str) -> Fault:
 
 def _settings(file: Path, about: dict[Path, dict[str, Any]]) -> str:
     """Check the settings of a run; return which stores were made with others, in words."""
-    file.stat()
+    lines = read_small(file, MOST_BYTES).decode(errors="replace").splitlines()
     now = declared.load(file)
+    if left_out := [group.name for group in fields(now) if f"[{group.name}]" not in lines]:
+        raise ValueError(f"the file ends too early, without the settings of {', '.join(left_out)}")
     differing = {store.name: names for store, known in about.items() if (names := _others(store, known, now))}
     words = "; ".join(f"{name} ({', '.join(names)})" for name, names in differing.items())
     return f"{file}: its settings are not those of {words}, as after a run that did not end" if words else ""
