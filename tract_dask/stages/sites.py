@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load on use: workers need few of them
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..errors import SettingsError
 from ..kernels.gaussian.intensity import Floats
@@ -109,11 +109,11 @@ def find_basis(places: Floats) -> Floats:
     """
     if len(places) < _FEWEST:
         raise _no_lattice(f"{len(places)} columns")
-    tree: Any = cKDTree(places)
+    tree: Any = scipy.spatial.cKDTree(places)
     distance, neighbour = tree.query(places, min(_NEIGHBOURS, len(places) - 1) + 1)
     differences = (places[neighbour[:, 1:]] - places[:, None]).reshape(-1, 2)
     spacing = float(np.median(distance[:, 1]))
-    tree = cKDTree(differences)
+    tree = scipy.spatial.cKDTree(differences)
     near = tree.query_ball_point(differences, _ALIKE * spacing)
     count = np.array([len(others) for others in near])
     a = _shortest(differences, near, count)
@@ -141,7 +141,7 @@ def number_sites(places: Floats, basis: Floats) -> tuple[NDArray[np.int64], Mask
     index, reached = np.zeros((len(places), 2), dtype=np.int64), np.zeros(len(places), dtype=bool)
     if not len(places):
         return index, reached
-    tree: Any = cKDTree(places)
+    tree: Any = scipy.spatial.cKDTree(places)
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
     limit = _ON_SITE * float(np.hypot(*basis.T).min())
     start = int(np.hypot(*(places - np.median(places, axis=0)).T).argmin())
