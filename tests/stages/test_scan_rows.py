@@ -11,10 +11,12 @@ from conftest import Scene
 from tract_dask import convert, fit_columns, open_movie, open_results
 from tract_dask.analysis.motion import places_in_frames
 from tract_dask.errors import SettingsError
+from tract_dask.export.tables import table
 from tract_dask.report.crystal import row_words
 from tract_dask.settings import ConvertSettings, FitSettings, MetadataSettings
 from tract_dask.stages.fit.job import prepare
 from tract_dask.stages.fit.row_homes import on_sites, sites_of
+from tract_dask.stages.fit.scan_rows import absorbed_variance
 from tract_dask.stages.fit.stage import fit_movie
 
 JITTER_PX = 1.3
@@ -92,10 +94,25 @@ def test_offsets_of_rows_are_found(scanned, fitted):
 
 
 def test_a_report_says_how_far_rows_were_displaced(fitted):
-    words = row_words(SimpleNamespace(tracks=fitted(scan_rows="sum").chunk()))
-    assert "displaced along x by 1" in words["text"]
-    assert not words["remedy"]
-    assert row_words(SimpleNamespace(tracks=fitted())) is None
+    def told(**settings):
+        run = SimpleNamespace(fit=FitSettings(**settings))
+        return row_words(SimpleNamespace(tracks=fitted(**settings).chunk(), settings=run))
+
+    summed, lattice = told(scan_rows="sum"), told(scan_rows="lattice")
+    assert "displaced along x by 1" in summed["text"]
+    assert summed["serious"]
+    assert "--scan-rows lattice" in summed["remedy"]
+    assert not lattice["serious"]
+    assert "share with their row" in lattice["text"]
+    assert not lattice["remedy"]
+    assert told() is None
+
+
+def test_tables_have_no_rows_of_rows(fitted):
+    tracks = fitted(scan_rows="sum")
+    rows = table(tracks)
+    assert len(rows) == tracks["status"].size
+    np.testing.assert_array_equal(rows["row_shift"], tracks["row_shift"].to_numpy().ravel())
 
 
 def test_a_lattice_says_where_columns_belong(scanned, fitted):
@@ -141,3 +158,17 @@ def test_columns_that_cannot_say_where_they_belong_are_refused(tmp_path, setting
 def test_a_filter_of_whole_frames_is_refused():
     with pytest.raises(SettingsError, match="offsets of rows"):
         FitSettings(scan_rows="sum", filter="wiener")
+
+
+def test_free_widths_are_refused():
+    with pytest.raises(SettingsError, match="known widths"):
+        FitSettings(scan_rows="sum", shape="free")
+
+
+def test_what_a_lattice_takes_of_offsets_is_in_their_errors():
+    """A line through offsets of rows is what moves and shears the lattice: its variance is that of made ones."""
+    rng, y = np.random.default_rng(7), np.arange(200.0)
+    made = rng.normal(0, 2.0, (400, 200))
+    lines = np.array([np.polyval(np.polyfit(y, offsets, 1), y) for offsets in made])
+    stated = np.mean([absorbed_variance(offsets) for offsets in made], axis=0)
+    np.testing.assert_allclose(stated, lines.var(axis=0), rtol=0.3)

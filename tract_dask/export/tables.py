@@ -90,7 +90,7 @@ def open_tracks(source: str | Path | xr.Dataset) -> xr.Dataset:
     return in_source_pixels(results.open_results(inside if inside.exists() else source))
 
 
-_LEFT_OUT = ("presence_vacuum", "motion_measured", "motion_stderr")
+_LEFT_OUT = ("presence_vacuum", "motion_measured", "motion_stderr", "row_offset", "row_offset_stderr")
 """Variables over the frames that are in no table."""
 
 

@@ -104,11 +104,20 @@ def row_words(run: Survey) -> dict[str, Any] | None:
     places = float((run.tracks["stderr"].sel(parameter="x") ** 2).mean().compute())
     text = (
         f"Rows of the frames were displaced along x by {np.sqrt(offset + error):.2g} px (rms), and columns by "
-        f"{np.sqrt(shift):.2g} px. x is freed from that (row_offset and row_shift in the results)."
+        f"{np.sqrt(shift):.2g} px. x is freed from that (row_offset and row_shift in the results). Errors of y and of "
+        "intensities still hold the noise that displaced rows leave, and are too large."
     )
     few = not shift > places
     remedy = "That is less than the errors of places: leave out --scan-rows." if few else ""
-    return {"title": "Offsets of scanned rows were undone", "text": text, "remedy": remedy, "serious": False}
+    how = run.settings.fit.scan_rows if run.settings is not None else ""
+    summed = how == "sum" and not few
+    if how == "lattice":
+        text += " Displacements that columns share with their row of the lattice are taken for offsets, too."
+    if summed:
+        left = np.sqrt(shift / run.tracks.sizes["frame"])
+        text += f" The summed image keeps about {left:.2g} px of the offsets, which means of x over frames share."
+        remedy = "For means over frames run again with --scan-rows lattice."
+    return {"title": "Offsets of scanned rows were undone", "text": text, "remedy": remedy, "serious": summed}
 
 
 def motion_words(run: Survey) -> dict[str, Any] | None:

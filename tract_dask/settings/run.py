@@ -293,6 +293,14 @@ class FitSettings(Settings):
                 repr(self.filter),
                 "Choose another filter, or scan_rows off",
             )
+        if self.scan_rows != "off" and self.shape == "free":
+            raise SettingsError(
+                "displaced rows are in the widths of single frames, too, and offsets are found by known widths",
+                "setting scan_rows (FitSettings)",
+                "shape fixed",
+                repr(self.shape),
+                "Choose shape fixed, or scan_rows off",
+            )
         if self.estimator == "poisson" and self.filters_frames:
             raise SettingsError(
                 "filtered frames are not counts",

@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]
 
 
+_FEWEST_ROWS = 8
 _TELLING = 2.5
 """Pixels so many sigmas from a column tell of its rows, but for those that are as near to another one."""
 
@@ -58,14 +59,33 @@ def undone(
         home = _home(seen, places, k, job) if sites is None else on_sites(seen[:, X], sites)
         raw, counting = blurred(seen, -blur), job.settings.counting
         found = displaced_rows(image, raw, home, size, counting=counting)
-        offset[k], stderr[k] = found.offset, np.sqrt(found.variance)
+        absorbed = np.zeros(height) if sites is None else absorbed_variance(found.offset)
+        offset[k], stderr[k] = found.offset, np.sqrt(found.variance + absorbed)
         known = np.isfinite(found.x)
         shift[k, known] = (seen[:, X] - found.x)[known]
-        errors[k, known, X] = np.sqrt(found.x_variance[known])
+        there = np.clip(np.rint(seen[known, Y]), 0, height - 1).astype(np.int64)
+        errors[k, known, X] = np.sqrt(found.x_variance[known] + absorbed[there])
     estimates[..., X] -= shift
     centroid[..., 1] -= shift
     found_all: Values = {"row_offset": offset, "row_offset_stderr": stderr, "row_shift": shift}
     return replace(fits, estimates=estimates, stderr=errors, centroid=centroid), found_all
+
+
+def absorbed_variance(offset: Floats) -> Floats:
+    """Return the variance (rows,) of what a lattice that is fitted to a frame takes of the offsets (rows,) of its rows.
+
+    The mean of all offsets moves the lattice, and their slope along y shears it: of offsets that are independent over
+    so many rows as their correlation tells, each is known as well as a line through them.
+    """
+    known = np.isfinite(offset)
+    if known.sum() < _FEWEST_ROWS:
+        return np.zeros(len(offset))
+    values, y = offset[known] - offset[known].mean(), np.arange(len(offset), dtype=np.float64)
+    power = max(float(values @ values), np.finfo(float).tiny)
+    along = np.array([values[lag:] @ values[:-lag] / power for lag in range(1, len(values) // 2)])
+    shared = 1 + 2 * along[: int(np.argmax(np.append(along, 0.0) <= 0))].sum()
+    y -= y[known].mean()
+    return np.asarray(np.mean(values**2) * shared / known.sum() * (1 + y**2 / np.mean(y[known] ** 2)))
 
 
 def free_hopped(fits: FrameFits, hopped: NDArray[np.bool_], rows: Values, job: Job) -> None:
