@@ -280,7 +280,6 @@ class FitSettings(Settings):
         "Free x of columns from the offsets of single rows of scanned frames (STEM): against their places in the summed"
         " image (sum), or on a lattice, for few frames",
         choices=("off", "sum", "lattice"),
-        common=True,
     )
 
     def __post_init__(self) -> None:
