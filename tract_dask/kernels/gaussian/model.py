@@ -97,3 +97,8 @@ def gaussian_image(parameters: npt.ArrayLike, shape: tuple[int, int]) -> Floats:
     """Return images (..., ny, nx) of Equation 1 for parameters (..., 7), sampled at the pixels' centres."""
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     return evaluate(parameters, columns, rows)
+
+
+def group_image(members: Floats, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
+    """Return the image of columns (..., members, 7) that share the background of the first, (..., y, x)."""
+    return np.asarray(above_background(members, x, y).sum(axis=-3) + members[..., 0, BACKGROUND, None, None])

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...kernels.gaussian.joint_shapes import ShapeFits, fit_shapes
-from ...kernels.gaussian.model import above_background
-from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, X, Y
+from ...kernels.gaussian.model import above_background, group_image
+from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, X, Y
 from ...kernels.windows import cut_windows
 from ...store.schema import Status
 
@@ -172,8 +172,7 @@ def _best(windows: Floats, masks: NDArray[np.bool_], start: Floats, sign: int, b
     shape = common.estimates[..., [SIGMA_A, SIGMA_B]]
     lower[..., [SIGMA_A, SIGMA_B]], upper[..., [SIGMA_A, SIGMA_B]] = shape / _SPREAD, shape * _SPREAD
     along = np.arange(windows.shape[2]), np.arange(windows.shape[1])[:, None]
-    shown = above_background(common.estimates, *along).sum(axis=1) + common.estimates[:, 0, BACKGROUND, None, None]
-    left = np.where(masks, windows - shown, 0.0)
+    left = np.where(masks, windows - group_image(common.estimates, *along), 0.0)
     own = fit_shapes(windows, masks, common.estimates, lower, upper, shape="own", max_iterations=60)
     number = masks.sum(axis=(1, 2))
     times = shared_by_pixels(left, masks, lags)

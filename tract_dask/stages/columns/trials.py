@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from ...kernels.gaussian.joint import MOST_MEMBERS
 from ...kernels.gaussian.joint_shapes import fit_shapes
-from ...kernels.gaussian.model import above_background
-from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, SIGMA_A, SIGMA_B, THETA, X, Y
+from ...kernels.gaussian.model import above_background, group_image
+from ...kernels.gaussian.parameters import AMPLITUDE, SIGMA_A, SIGMA_B, THETA, X, Y
 from ..groups import INSEPARABLE, groups_of
 from .group_fits import rendered
 
@@ -160,7 +160,7 @@ def _at_the_peak(trial: Trial, before: Floats, sign: int) -> Floats:
     along = np.arange(side)
     new = before[:, :1].copy()
     for k, (window, mask, group) in enumerate(zip(trial.windows, trial.masks, before, strict=True)):
-        model = above_background(group, along, along[:, None]).sum(axis=0) + group[0, BACKGROUND]
+        model = group_image(group, along, along[:, None])
         sigma = max(0.7 * float(np.sqrt(group[0, SIGMA_A] * group[0, SIGMA_B])), 0.7)
         left = ndimage.gaussian_filter(np.where(mask, sign * (window - model), 0.0), sigma)
         y, x = np.unravel_index(int(np.argmax(np.where(mask, left, -np.inf))), mask.shape)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...kernels.gaussian.correlated import noise_spectrum
 from ...kernels.gaussian.information import group_slopes
 from ...kernels.gaussian.joint import fit_joint
-from ...kernels.gaussian.model import above_background, blurred, evaluate
+from ...kernels.gaussian.model import blurred, evaluate, group_image
 from ...kernels.gaussian.parameters import AMPLITUDE, BACKGROUND, X, Y
 from ...kernels.windows import blur_variance, gaussian_kernel, spreading
 from ...settings.run import FitSettings
@@ -214,7 +214,7 @@ def _noise(
     chosen = order[np.unique(np.linspace(0, n - 1, _MODELS).round().astype(int))]
     nearest = np.abs(spread[:, None] - spread[chosen]).argmin(axis=1)
     grid = np.arange(masks.shape[2]), np.arange(masks.shape[1])[:, None]
-    images = above_background(own[chosen], *grid).sum(axis=1) + own[chosen][:, :1, BACKGROUND, None]
+    images = group_image(own[chosen], *grid)
     stated = fit_joint(
         images.astype(np.float32),
         masks[chosen],
@@ -252,7 +252,7 @@ def _exact(
     reach = kernel.size // 2
     down, across = (np.arange(-reach, side + reach) for side in mask.shape)
     narrow = blurred(group, -blur_variance(settings.window_blur_px))
-    raw = above_background(narrow, across, down[:, None]).sum(axis=0) + narrow[0, BACKGROUND]
+    raw = group_image(narrow, across, down[:, None])
     counted = settings.counting and (raw > 0).any()
     variance = np.maximum(raw, _LEAST * raw.max()) if counted else np.ones_like(raw)
     power, spread = ([spreading(side, weights) for side in mask.shape] for weights in (kernel**2, kernel))

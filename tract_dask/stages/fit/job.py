@@ -239,15 +239,15 @@ class Job:
         places = np.where(self.known[:, None], self.reference[:, [Y, X]], np.nan)
         return sites_of(places, schema.texts(self.columns["kind"].to_numpy()))
 
-    def check_rows(self, usable: int) -> None:
-        """Check that columns say where they belong along x, in so many usable frames, if that is asked for.
+    def check_rows(self) -> None:
+        """Check that columns say where they belong along x, if that is asked for.
 
         Raises
         ------
         SettingsError
             Where frames are too few for their sum, or the columns make no lattice.
         """
-        check_frames(self.settings, usable)
+        check_frames(self.settings, int(np.count_nonzero(~self.bad)) - len(self.lost))
         _ = self.row_sites
 
     @cached_property
@@ -333,7 +333,8 @@ def prepare(
     """Return all that the tasks need, checked; see :func:`fit_columns` for the arguments and errors."""
     schema.validate(columns, schema.COLUMNS, "columns")
     shift = schema.drift_of(drift, movie.n_frames)
-    settings = replace(settings, blur_sigma_px=(blur := resolve_blur(settings.blur_sigma_px, columns)))
+    blur = resolve_blur(settings.blur_sigma_px, columns)
+    settings = replace(settings, blur_sigma_px=blur)
     _check_drift_columns(settings, columns)
     box = settings.vacuum_box
     check_box(box, movie.shape[1:], shift)
@@ -346,7 +347,6 @@ def prepare(
     camera = camera_of(movie, summed)
     if settings.estimator == "poisson" and camera.zero is None and movie.offset == 0 and movie.pixels.dark is None:
         check_counts(statistics["frame_min"].to_numpy())
-    usable = int(np.count_nonzero(~bad)) - len(lost := _lost(drift))
     job = Job(
         columns,
         shift,
@@ -358,15 +358,15 @@ def prepare(
         rounding_variance=columns.attrs.get("rounding_variance_px2", 0.0),
         refined_by=_refined_by(settings, drift),
         settings=settings,
-        lost=lost,
+        lost=_lost(drift),
         offset=movie.gain * movie.offset,
         dark_variance=0.0 if settings.filters_frames else dark_variance(movie, camera),
         correlation=camera.correlation if camera.shared.size > 1 else None,
         full_scale=_full_scale(movie),
-        summed=_summed_frames(movie, columns, summed, usable),
+        summed=_summed_frames(movie, columns, summed, int(np.count_nonzero(~bad)) - len(_lost(drift))),
         frame=movie.shape[1:],
     )
-    job.check_rows(usable)
+    job.check_rows()
     return job
 
 
